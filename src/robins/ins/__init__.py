@@ -1,16 +1,16 @@
 """Inertial navigation: frames, increments, mechanisation, error dynamics.
 
-- `frames`: NED/FRD and ENU/RFU, the same thing relabelled.
+- `frames`: NED/FRD and ENU/RFU, and the conversion between them.
 - `increments`: IMU samples to rotation vectors and velocity increments.
 - `mechanise`: attitude, velocity and position from increments (``step``, ``mechanise``).
-- `state`: the state of an aided INS, moved over a block, alone or with how errors go through it.
+- `state`: the state of an aided INS, propagated over a block, with or without its transition.
 - `errors`: the error dynamics F and G.
-- `imu_errors`: what is wrong with gyros and accelerometers, from data sheets.
+- `imu_errors`: error models of gyros and accelerometers, from data sheets.
 - `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
-- `magnetometer_calibration`: hard and soft iron from turning about (import it by its name).
-- `vector_attitude`: attitude from stars; `star_identification`: which stars those
-  are, lost in space or nearly known (import them by their names).
-- `alignment`: attitude at rest, from gravity, Earth rate or velocity; `rest`: when that is.
+- `magnetometer_calibration`: hard and soft iron from rotations (import it by its name).
+- `vector_attitude`: attitude from stars; `star_identification`: their identification, lost in space
+  or with an approximate attitude (import them by their names).
+- `alignment`: attitude at rest, from gravity, Earth rate or velocity; `rest`: detection of rest.
 """
 
 from robins.ins.alignment import (

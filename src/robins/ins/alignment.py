@@ -2,9 +2,9 @@
 
 At rest the accelerometers measure the reaction to gravity, which gives roll and pitch (`level`),
 and the gyros measure the rotation of the Earth, which gives the heading if they are good enough
-(`gyrocompass`; Titterton & Weston 2004, chapter 10; Groves 2013, section 5.6). Where they are not,
-a vehicle that drives straight ahead has its heading in its velocity (`heading_from_velocity`).
-`align` chooses by itself from a record at rest; `is_static` tests a record for rest.
+(`gyrocompass`; Titterton & Weston 2004, chapter 10; Groves 2013, section 5.6). If they are not,
+the velocity of a vehicle that drives straight ahead gives its heading (`heading_from_velocity`).
+`align` chooses the method for a record at rest; `is_static` tests a record for rest.
 
 Attitudes are q_nb, north-east-down from forward-right-down. Uncertainty is the covariance of phi in
 ``C_true = exp(phi x) C_estimate``, phi along north, east, down, as in `robins.rotation.Rotation`.
@@ -14,7 +14,7 @@ With errors df of the specific force and dw of the rates, measured less true, al
 
 the last for gyrocompassing: an east gyro error of 0.01 deg/h makes 3.2 arcmin of heading at 45 deg.
 
-NumPy, for use once; leading axes are many alignments at once.
+NumPy, for single use; leading axes are independent alignments.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from robins.ins.imu_errors import ImuErrorModel, mean_sigma
 from robins.rotation import Rotation, from_euler, to_dcm
 
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3.0)
-"""Sigma of an angle of which nothing is known: uniform over the circle."""
+"""Sigma of an unknown angle, uniform over the circle."""
 
-_LARGEST_HEADING_SIGMA_RAD = 0.3  # where the linear error formulas still hold
+_LARGEST_HEADING_SIGMA_RAD = 0.3  # largest for which the linear error formulas hold
 _DEG_H = np.pi / 180.0 / 3600.0
 
 
@@ -49,7 +49,7 @@ class StaticCheck(NamedTuple):
     """Result of a test for rest, with the mean values of the record."""
 
     static: bool
-    reasons: tuple[str, ...]  # why not, one sentence each
+    reasons: tuple[str, ...]  # reasons against rest, one sentence each
     omega_ib_b: np.ndarray  # (3,) rad/s, mean
     f_b: np.ndarray  # (3,) m/s^2, mean
     sigma_omega: np.ndarray  # (3,) rad/s, of a sample
@@ -126,7 +126,7 @@ def level(
     heading_rad: ArrayLike | float = 0.0,
     heading_sigma_rad: ArrayLike | float = UNKNOWN_HEADING_RAD,
 ) -> Alignment:
-    """Roll and pitch from the mean specific force at rest; the heading is given from elsewhere.
+    """Roll and pitch from the mean specific force at rest; the heading is given.
 
     ``roll = atan2(-f_y, -f_z)`` and ``pitch = atan2(f_x, hypot(f_y, f_z))`` (Groves 2013, section
     5.6).
@@ -155,8 +155,8 @@ def level(
     C_nb = to_dcm(q_nb)
     heading, heading_sigma = (np.broadcast_to(x, pitch.shape) for x in (heading, heading_sigma))
 
-    # What a tilt leaves of phi_D at a heading held fast: phi_D = d(heading) - tan(pitch) d, with d
-    # the tilt along the nose.
+    # phi_D due to a tilt at fixed heading: phi_D = d(heading) - tan(pitch) d, with d the tilt
+    # along the nose.
     force = _tilt_of_force(f, C_nb)
     force[..., 2, :] = -np.tan(pitch)[..., None] * (
         np.cos(heading)[..., None] * force[..., 0, :]
@@ -191,7 +191,7 @@ def gyrocompass(
     """Attitude at rest from gravity and the rotation of the Earth.
 
     The two vectors are known in both frames, which fixes the attitude (TRIAD; Black 1964); gravity
-    decides about the level, the Earth's rotation about the heading alone.
+    determines roll and pitch, the Earth's rotation the heading only.
 
     Args:
         omega_ib_b: (..., 3) mean rates [rad/s].
@@ -203,8 +203,8 @@ def gyrocompass(
 
     Raises:
         ValueError: a vector or a sigma that is not finite, a sigma below zero; free fall; specific
-            force that is not gravity's; rates that are not the Earth's; a heading sigma above 0.3
-            rad, by too high a latitude or too poor gyros.
+            force that is not gravity; rates that are not the Earth's; a heading sigma above 0.3
+            rad, due to a high latitude or poor gyros.
     """
     f, omega, lat = _specific_force(f_b), np.asarray(omega_ib_b, float), np.asarray(lat_rad, float)
     _refuse_bad_vectors("omega_ib_b", omega)
@@ -245,7 +245,7 @@ def gyrocompass(
 def triad(f_b: ArrayLike, north_b: ArrayLike) -> np.ndarray:
     """C_nb (..., 3, 3) for which specific force points up and another vector north (Black 1964).
 
-    Gravity decides about the level, the other vector about the heading alone: it may dip.
+    Gravity determines roll and pitch, the other vector the heading only: it may dip.
 
     Args:
         f_b: (..., 3) specific force at rest, of any length above zero.
@@ -267,12 +267,12 @@ def heading_from_velocity(
 ) -> tuple[float, float]:
     """Heading and its sigma [rad] from GNSS velocities of a vehicle that moves straight ahead.
 
-    It is the direction of motion over ground, taken for that of the nose: the vehicle must move
-    forwards, not backwards, without turning (so the lever arm of the antenna does not matter), and
-    its slip, or drift in wind or current, has the sigma ``sideslip_sigma_rad``.
+    The course over ground is taken as heading: the vehicle must move forwards, without turning (so
+    the lever arm of the antenna does not matter), and its sideslip, or drift in wind or current,
+    has the sigma ``sideslip_sigma_rad``.
 
     Args:
-        v_n: (3,) or (m, 3) velocities [m/s] of a straight piece, NaN where missing.
+        v_n: (3,) or (m, 3) velocities [m/s] on a straight line, NaN where missing.
         sigma_v: their sigmas, of each axis and fix, of each axis, or of all.
         smallest_speed: over ground [m/s], below which the direction is not trusted.
         sideslip_sigma_rad: sigma of the angle between nose and motion.
@@ -357,10 +357,10 @@ def align(
 def static_sigmas(
     model: ImuErrorModel, duration_s: float, f_b: ArrayLike, omega_ib_b: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One sigma (3,) of the mean rates and of the mean specific force at rest, all errors in.
+    """One sigma (3,) of the mean rates and of the mean specific force at rest, from all errors.
 
-    To the `mean_sigma` of either triad come scale factors and misalignments times what it measures,
-    and the g-sensitivity of the gyros.
+    These are the `mean_sigma` of each triad, scale factors and misalignments times the measured
+    vector, and the g-sensitivity of the gyros.
     """
     f, omega = np.asarray(f_b, float), np.asarray(omega_ib_b, float)
     out = []

@@ -1,22 +1,21 @@
-"""Overlapping Allan deviation of inertial sensor data, with bounds, and the noises in it.
+"""Overlapping Allan deviation of inertial sensor data, with bounds, and fitted noise terms.
 
-`deviation` estimates, `fit` reads the model off the curve (IEEE Std 952-1997, Annex C): angle or
+`deviation` estimates the curve, `fit` fits the noise model (IEEE Std 952-1997, Annex C): angle or
 velocity random walk N, bias instability B, rate random walk K and, if requested, quantisation Q
-and rate ramp R. Everything is NumPy and per axis; SI units go through, so for gyros in rad/s
-the coefficients come in rad, rad/sqrt(s), rad/s, rad/s/sqrt(s), rad/s^2.
+and rate ramp R. Everything is NumPy and per axis, in SI units: for gyros in rad/s the coefficients
+are in rad, rad/sqrt(s), rad/s, rad/s/sqrt(s), rad/s^2.
 
 Outputs that are low-passed, averaged or resampled have too little power at short times: there the
-slope is not that of white noise. Whatever the filter, an autocovariance that ends leaves of white
-noise, for times beyond it,
+slope is not that of white noise. For any filter whose autocovariance is of finite duration, the
+Allan variance of filtered white noise at longer times is
 
     N^2 / tau - C / tau^2,    C = 3 integral_0^inf t r(t) dt
 
-of the rate's autocovariance r. Where the requested terms do not explain the curve, `fit` takes C
-with them, leaves out so many of the shortest times as it takes to explain the rest, and then goes
-on to twice that time.
+with the rate's autocovariance r. If the requested terms do not explain the curve, `fit` adds the
+term C, omits the shortest times until the rest is explained, and then all up to twice that time.
 
-Bounds and weights rest on one thing, the covariance of the estimates under the noises found in the
-data (`robins.ins.allan_noise`), not on a rule of thumb for white noise.
+Bounds and weights come from the covariance of the estimates under the fitted noise terms
+(`robins.ins.allan_noise`), not from a rule of thumb for white noise.
 """
 
 from __future__ import annotations
@@ -35,15 +34,15 @@ from robins.ins.allan_noise import TERMS, Moments, mean_variances, moments
 from robins.ins.imu_errors import FLICKER_FLAT, MARKOV_PEAK, TriadErrors
 from robins.units import from_si
 
-_FEWEST_CLUSTERS = 9  # in the longest averages; gives them about ten degrees of freedom
+_FEWEST_CLUSTERS = 9  # in the longest averages, which so have about ten degrees of freedom
 _PER_DECADE = 10
 _HUGE = 1e100  # of a sample, or one over a change
-# Probabilities of a residual so large: below the first a whole curve is doubted, above the second a
-# part of it is explained, above the third it is so for want of a better.
+# p-values of the residual: below the first a fit of the whole curve is rejected, above the second
+# that of a part is accepted, above the third it is accepted if there is no better one.
 _DOUBTED, _EXPLAINED, _BARELY = 1e-3, 1e-2, 1e-5
-_FURTHER = 2  # points, each 1.5 times the time of the one before at least
+_FURTHER = 2  # further points omitted, each at least 1.5 times the previous time
 _WHITE = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
-_FIELD_UNITS = {  # name -> term, unit; of a ramp, what the sensor drifts in an hour
+_FIELD_UNITS = {  # name -> term, unit; for a ramp, the drift in an hour
     "gyro": {
         "angle_random_walk": ("N", "deg/sqrt(h)"),
         "noise_density": ("N", "deg/s/sqrt(Hz)"),
@@ -89,16 +88,16 @@ class NoiseCoefficients(NamedTuple):
 
 
 class AllanFit(NamedTuple):
-    """Noise terms read off an Allan curve. Terms not requested are zero with zero interval."""
+    """Noise terms fitted to an Allan curve. Terms not requested are zero with zero interval."""
 
     value: NoiseCoefficients
-    lower: NoiseCoefficients  # interval of the given confidence; 0 where a term is not resolved
+    lower: NoiseCoefficients  # of the interval of the given confidence; 0 if a term is not resolved
     upper: NoiseCoefficients
-    chi2: np.ndarray  # (A,) weighted squared residual; far above dof: the terms do not explain it
-    dof: np.ndarray  # (A,) degrees of freedom of it
+    chi2: np.ndarray  # (A,) weighted squared residual; far above dof if the terms do not fit
+    dof: np.ndarray  # (A,) its degrees of freedom
     terms: str
     confidence: float
-    from_s: np.ndarray  # (A,) shortest cluster time that was fitted; above the first: coloured
+    from_s: np.ndarray  # (A,) shortest fitted cluster time; above the first one if coloured
 
 
 def deviation(
@@ -120,13 +119,13 @@ def deviation(
         dt_s: sampling interval [s]; or
         time_ns: (N,) sampling times, from which the interval is taken and gaps are found: squares
             are averaged over the differences within all stretches between them.
-        clusters: cluster sizes in samples; ten per decade while there are nine of the largest if
-            not given.
+        clusters: cluster sizes in samples; if not given, ten per decade, up to the size of which
+            there are nine.
         confidence: of the interval, between 0 and 1.
 
     Raises:
         ValueError: neither or both of dt_s and time_ns; a step back or a repeated time; NaN or
-            infinite data; constant data or a mere drift; too few samples; clusters out of range.
+            infinite data; constant data or a pure ramp; too few samples; clusters out of range.
     """
     x = np.asarray(rate, float)
     x = x[:, None] if x.ndim == 1 else x
@@ -168,7 +167,7 @@ def stretches(time_ns: np.ndarray) -> np.ndarray:
 def _variances(parts: list[np.ndarray], sizes: np.ndarray) -> np.ndarray:
     squares, count = np.zeros(len(sizes)), np.zeros(len(sizes))
     for rate in parts:
-        # Without its mean the running sum stays small; second differences do not see the mean.
+        # Removing the mean keeps the running sum small; it cancels in second differences.
         angle = np.concatenate([[0.0], np.cumsum(rate - rate.mean())])
         for i, m in enumerate(sizes[2 * sizes <= len(rate)]):
             z = angle[2 * m :] - 2.0 * angle[m:-m] + angle[: -2 * m]
@@ -180,17 +179,17 @@ def _variances(parts: list[np.ndarray], sizes: np.ndarray) -> np.ndarray:
 def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     """Noise terms of an Allan curve by generalised least squares.
 
-    The Allan variance is linear in the squared coefficients, which are found not negative and
-    with the inverse covariance of the estimates as weight; that covariance, which grows with the
-    variance itself and so makes the fit one of relative (logarithmic) errors, is taken under the
-    terms found, until nothing changes. Neighbouring points of the curve share their data: the
-    covariance knows it, so the intervals are not too short. They hold if the terms explain the
-    curve: look at ``chi2`` against ``dof``.
+    The Allan variance is linear in the squared coefficients, which are fitted as nonnegative, with
+    the inverse covariance of the estimates as weight. That covariance grows with the variance
+    itself, which makes the fit one of relative (logarithmic) errors; it is computed from the fitted
+    terms, and iterated until nothing changes. It includes the correlation of neighbouring points,
+    which share their data, so the intervals are not too short. They hold if the terms explain the
+    curve: compare ``chi2`` with ``dof``.
 
-    Where the terms do not explain the whole curve (a residual of a probability below 1e-3), short
-    times are taken to be coloured (module docstring): the term -C / tau^2 joins in, and the
-    shortest times are left out one by one until the rest is explained, and two more; ``from_s``
-    is the first time left. If nothing explains it, the fit is that of the whole curve.
+    If the terms do not explain the whole curve (a residual of a probability below 1e-3), short
+    times are assumed to be coloured (module docstring): the term -C / tau^2 is added, and the
+    shortest times are omitted one by one until the rest is explained, and two more; ``from_s`` is
+    the first time left. If no part is explained, the fit is that of the whole curve.
 
     Args:
         allan: from `deviation`.
@@ -199,8 +198,8 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
 
     Raises:
         ValueError: unknown or repeated terms; a curve too short to separate the terms; a curve
-            that fits no noise at all.
-        ArithmeticError: a curve so unlike the terms that the fit does not settle.
+            that no term fits.
+        ArithmeticError: the fit does not converge.
     """
     if len(set(terms)) != len(terms) or not set(terms) <= set(TERMS) or set(terms) <= {"R"}:
         raise ValueError(
@@ -208,7 +207,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
         )
     require(0.0 < confidence < 1.0, "confidence must lie between 0 and 1", confidence)
     _refuse_short_curve(allan, terms)
-    # Sizes closer than this carry next to no news and make the covariance nearly singular.
+    # Sizes closer than this add hardly any information and make the covariance nearly singular.
     keep = [0]
     for i, m in enumerate(allan.clusters):
         if m >= 1.5 * allan.clusters[keep[-1]]:
@@ -229,7 +228,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
 
 
 def term_curves(coefficients: NoiseCoefficients, tau_s: np.ndarray) -> np.ndarray:
-    """Allan deviation (5, T, A) of each term Q, N, B, K, R; the whole is the root of their squares.
+    """Allan deviation (5, T, A) of each term Q, N, B, K, R; their root sum square is the total.
 
     Args:
         coefficients: of a fit, or of a data sheet in SI.
@@ -239,7 +238,7 @@ def term_curves(coefficients: NoiseCoefficients, tau_s: np.ndarray) -> np.ndarra
 
 
 class CoefficientInterval(NamedTuple):
-    """A coefficient of each axis (A,) in a unit of the field, and the bounds of its interval."""
+    """A coefficient of each axis (A,) in a data-sheet unit, and the bounds of its interval."""
 
     unit: str
     value: np.ndarray
@@ -250,7 +249,7 @@ class CoefficientInterval(NamedTuple):
 def in_field_units(
     fitted: AllanFit, sensor: Literal["gyro", "accel"]
 ) -> dict[str, CoefficientInterval]:
-    """The terms of a fit as data sheets state them.
+    """Terms of a fit in the units of data sheets.
 
     White noise is stated twice, as random walk and as density: the density here is that of the
     two-sided spectrum (IEEE Std 952), so 1 deg/sqrt(h) is 1/60 deg/s/sqrt(Hz); a data sheet that
@@ -270,12 +269,12 @@ def in_field_units(
 def triad_errors(fitted: AllanFit, correlation_time_s: float | None = None) -> TriadErrors:
     """White noise, random walk, ramp, quantisation and Markov bias of a triad from its Allan fit.
 
-    Terms whose interval reaches zero are not resolved by the data and left out. Flicker noise has
-    no finite model: the bias instability becomes a Gauss-Markov process whose Allan deviation peaks
-    at the flat part of the fit, where a correlation time is given.
+    Terms whose interval reaches zero are not resolved by the data and omitted. Flicker noise has no
+    finite-order model: if a correlation time is given, the bias instability becomes a Gauss-Markov
+    process whose Allan deviation peaks at the flat part of the fit.
 
     Raises:
-        ValueError: a fit of another number of axes; a correlation time that is not positive.
+        ValueError: a fit of other than three axes; a correlation time that is not positive.
     """
     if np.shape(fitted.value.N) != (3,):
         raise ValueError(f"a triad has three axes, the fit has {np.size(fitted.value.N)}")
@@ -291,7 +290,7 @@ def triad_errors(fitted: AllanFit, correlation_time_s: float | None = None) -> T
         white=resolved("N", 1.0),
         walk=resolved("K", 1.0),
         ramp=resolved("R", 1.0),
-        quantum=resolved("Q", np.sqrt(12.0)),  # roundings are uniform over a quantum
+        quantum=resolved("Q", np.sqrt(12.0)),  # rounding errors are uniform over a quantum
         markov_sigma=flicker,
         markov_tau_s=None if flicker is None else correlation_time_s,
     )
@@ -300,9 +299,9 @@ def triad_errors(fitted: AllanFit, correlation_time_s: float | None = None) -> T
 def _explained(
     variance: np.ndarray, expected: Moments, index: np.ndarray, least: int
 ) -> tuple[np.ndarray, np.ndarray, float, int, int]:
-    """`_fit_axis` of the curve, or of what is explained of it; degrees of freedom, and from where.
+    """`_fit_axis` of the curve, or of its explained part; degrees of freedom, and first point.
 
-    At least so many points are fitted.
+    At least `least` points are fitted.
     """
     points, count = len(variance), len(index)
 
@@ -312,12 +311,12 @@ def _explained(
         rest = Moments(rest.mean, rest.quadratic[:, first:], rest.ramp[:, first:])
         try:
             found = _fit_axis(variance[first:], rest, index, coloured)
-        except (ArithmeticError, ValueError):  # no such noise in what is left
+        except (ArithmeticError, ValueError):  # the terms do not fit the rest
             return None
         return *found, points - first - count - coloured, first
 
     def unlikely(found: tuple | None) -> float:
-        """Probability of a residual so large; 0 without a fit."""
+        """p-value of the residual; 0 without a fit."""
         return 0.0 if found is None else float(chdtrc(found[3], found[2]))
 
     whole = tried(0, coloured=False)
@@ -327,8 +326,8 @@ def _explained(
     for enough in (_EXPLAINED, _BARELY):
         for first in parts:
             if unlikely(tried(first)) >= enough:
-                # What is explained may still be wrong by as much as does not show: what colour does
-                # beyond C / tau^2 dies away, so on to more than twice the time.
+                # An undetected error may remain: the effect of colour beyond C / tau^2 decays, so
+                # omit points up to more than twice the time.
                 further = tried(min(first + _FURTHER, parts[-1]))
                 if further is not None:
                     return further
@@ -346,7 +345,7 @@ def _fit_axis(
         before = expected.mean @ p
         p, sigma, chi2 = _weighted_fit(variance, expected, index, p, coloured)
         _refuse_no_noise(p)
-        # Far below the resolution of the data, and reached in ten to thirty passes.
+        # far below the resolution of the data; reached in ten to thirty passes
         if np.all(np.abs(expected.mean @ p - before) <= 1e-6 * before):
             return p, sigma, chi2
     raise ArithmeticError(
@@ -360,7 +359,7 @@ def _weighted_fit(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """One pass of `_fit_axis`, weighted by the covariance under the mix p.
 
-    Coloured: with -C / tau^2, which has no part in that covariance.
+    If coloured, with -C / tau^2, which does not enter that covariance.
     """
     root = np.linalg.cholesky(expected.covariance(p))
     colour = [-expected.mean[:, 0]] if coloured else []
@@ -385,7 +384,7 @@ def _weighted_fit(
 def _rough_mix(
     variance: np.ndarray, mean: np.ndarray, edf: np.ndarray, index: np.ndarray
 ) -> np.ndarray:
-    """Squared coefficients (5,), not negative, that fit with relative weights by edf alone."""
+    """Nonnegative squared coefficients (5,), fitted with relative weights from edf only."""
     design = mean[:, index] * (np.sqrt(edf) / variance)[:, None]
     size = np.linalg.norm(design, axis=0)
     p = np.zeros(5)
@@ -418,8 +417,8 @@ def _cluster_sizes(clusters: ArrayLike | None, lengths: np.ndarray) -> np.ndarra
 
 
 def _longest(lengths: np.ndarray) -> int:
-    """Largest size of which stretches long enough for a difference hold enough clusters."""
-    # Half of the steps at least are no gaps, so there are enough of one sample.
+    """Largest cluster size of which stretches long enough for a difference contain enough."""
+    # at least half of the steps are no gaps, so there are enough clusters of one sample
     low, high = 1, int(lengths.sum()) // _FEWEST_CLUSTERS
     while low < high:
         m = (low + high + 1) // 2
@@ -476,7 +475,7 @@ def _refuse_bad_values(x: np.ndarray) -> None:
 
 
 def _refuse_short_curve(allan: Allan, terms: str) -> None:
-    # Terms are separated by the slope of the curve: a decade for each but the first.
+    # terms are separated by the slope of the curve: a decade for each but the first
     needed = 10 ** (len(terms) - 1)
     have = allan.clusters[-1] / allan.clusters[0]
     if have < needed or len(allan.clusters) < len(terms) + 2:

@@ -1,4 +1,4 @@
-"""Allan variance of the noises of an inertial sensor: mean and covariance.
+"""Mean and covariance of the Allan variance of inertial sensor noise.
 
 The overlapping estimate at cluster size m is the mean of z_i^2 / (2 tau^2) over the second
 differences ``z_i = x_i - 2 x_(i+m) + x_(i+2m)`` of the integrated output x. For each noise,
@@ -18,8 +18,8 @@ covariance. So the covariance of two estimates, at sizes m and m', is the sum ov
 
 over ``4 tau^2 tau'^2 M M'``, each lag counted as often as it occurs: the method by which C. A.
 Greenhall and W. J. Riley, "Uncertainty of stability variances based on finite differences" (PTTI
-2003), find the equivalent degrees of freedom ``2 mean^2 / variance`` of one estimate, here kept
-for noises that add and for pairs of cluster sizes.
+2003), find the equivalent degrees of freedom ``2 mean^2 / variance`` of one estimate, here extended
+to sums of noise terms and pairs of cluster sizes.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _SECOND_DIFFERENCE = ((0, 1.0), (1, -2.0), (2, 1.0))
 
 
 class Moments(NamedTuple):
-    """Mean and covariance of overlapping Allan variances, for any mix of the noises.
+    """Mean and covariance of overlapping Allan variances, for any mix of noise terms.
 
     A mix is a vector p of the squares ``(Q^2, N^2, B^2, K^2, R^2)``.
     """
 
     mean: np.ndarray  # (T, 5): the expected variances are mean @ p
-    quadratic: np.ndarray  # (T, T, 4, 4): covariance of the random terms, a form in p
-    ramp: np.ndarray  # (T, T, 4): covariance of the random terms with the ramp's share
+    quadratic: np.ndarray  # (T, T, 4, 4): covariance of the random terms, a quadratic form in p
+    ramp: np.ndarray  # (T, T, 4): covariance of the random terms times the ramp
 
     def covariance(self, p: np.ndarray) -> np.ndarray:
         """Covariance (..., T, T) of the estimates under the mix p (..., 5)."""
@@ -67,8 +67,8 @@ def moments(
 
     Args:
         clusters: (T,) sizes in samples, ascending, at most half of the longest stretch.
-        n_samples: number of rate samples; the integrated output has one point more. Of a record
-            with gaps those of each stretch (S,): stretches are taken to be independent.
+        n_samples: number of rate samples; the integrated output has one point more. For a record
+            with gaps, numbers of each stretch (S,), which are taken to be independent.
         dt_s: sampling interval [s].
     """
     lengths = np.sort(np.atleast_1d(n_samples))
@@ -90,7 +90,7 @@ def moments(
 
 
 def _beyond(lengths: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Sum (L,) of what each of the ascending lengths (S,) is above a least one (L,)."""
+    """Sum (L,) over ascending lengths (S,) of their excess over each least one (L,)."""
     sums = np.append(np.cumsum(lengths[::-1])[::-1], 0)
     first = np.searchsorted(lengths, least)
     return sums[first] - (len(lengths) - first) * least
@@ -128,7 +128,7 @@ def _cross_covariance(lags: np.ndarray, m: int, m_large: int) -> np.ndarray:
             log_t = np.log(np.maximum(t, 1.0))
             s = np.stack([t == 0.0, -t / 2, t * t * log_t / (2 * np.pi), t**3 / 12])
             total += w_p * w_q * s
-    # Without overlap of the two differences white and integrated white noise are independent; the
-    # rounding of |t|^3 would couple them.
+    # Without overlap of the two differences, white noise and its integral are independent;
+    # rounding of |t|^3 would correlate them.
     total[[1, 3]] *= (lags > -2 * m_large) & (lags < 2 * m)
     return total

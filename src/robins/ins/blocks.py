@@ -1,9 +1,9 @@
-"""Cut a stream of IMU increments into blocks, one per filter epoch.
+"""Blocks of IMU increments, one per filter epoch.
 
 The IMU runs at hundreds of hertz, the covariance and the aids at a few. A block holds the
-increments between two epochs, padded with increments of zero length, so that a whole log has one
-shape and a run is one scan over blocks with one scan inside. An increment that an epoch falls into
-is split there, so that every measurement meets the state at its own time.
+increments between two epochs, padded with increments of zero duration, so that a whole log has one
+shape and a run is one scan over blocks with one scan inside. An increment that contains an epoch is
+split there, so that every measurement is applied to the state at its own time.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ class Blocks(NamedTuple):
 
     increments: Increments  # dt (E, K), theta (E, K, 3), dv (E, K, 3); padded with zeros
     epoch_s: np.ndarray  # (E,) time at the end of each block
-    duration_s: np.ndarray  # (E,) length of each block
-    parent: np.ndarray  # (E, K) index of the increment each piece is of; -1 where padded
+    duration_s: np.ndarray  # (E,) s, duration of each block
+    parent: np.ndarray  # (E, K) index of the increment of each piece; -1 where padded
 
 
 def epochs_between(
     start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float, even: bool = True
 ) -> np.ndarray:
-    """Epochs at all wanted times in (start, end], and between them so that none is too long.
+    """Epochs at all wanted times in (start, end], with more between them to limit block length.
 
     Args:
         start_s: where the first block begins.
         end_s: where the last block ends.
         wanted_s: times that need an epoch of their own (measurements).
         longest_s: longest block allowed.
-        even: split in even parts; else in longest ones and a rest, without knowing the next time.
+        even: split evenly; else into longest blocks and a rest, as without knowledge of the next
+            wanted time.
 
     Returns:
         (E,) strictly increasing; the last one is end_s.
@@ -48,7 +49,7 @@ def epochs_between(
     edges = np.unique(np.concatenate([[start_s], wanted, [end_s]]))
     out = []
     for a, b in pairwise(edges):
-        # a hair of tolerance keeps 1.0000001 s from becoming two
+        # tolerance, so that 1.0000001 s does not become two blocks
         pieces = max(1, int(np.ceil((b - a) / longest_s - 1e-6)))
         part = np.arange(1, pieces + 1)
         out.append(a + (b - a) * part / pieces if even else a + longest_s * part)
@@ -57,7 +58,7 @@ def epochs_between(
 
 
 def usual_width(longest_s: float, usual_s: float) -> int:
-    """Pieces that the longest block of a sensor holds by its usual interval, and some to spare."""
+    """Number of pieces in the longest block at the usual interval, with some to spare."""
     return -(-math.ceil(1.1 * longest_s / usual_s + 2.0) // 8) * 8
 
 
@@ -67,7 +68,7 @@ _SLACK_S = 1e-9  # rounding of a time stamp
 def _shares(
     time_s: np.ndarray, dt: np.ndarray, start_s: float, epoch_s: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Pieces between epochs: end [s], number of the increment, share of it, and share before."""
+    """Pieces between epochs: end [s], index of the increment, share of it, and share before."""
     begin_s = time_s - dt
     inside = (time_s > start_s) & (begin_s < epoch_s[-1])
     edges = np.concatenate([[start_s], epoch_s, time_s[inside]])
@@ -86,14 +87,14 @@ def _shares(
 def cut(
     increments: Increments, time_s: np.ndarray, start_s: float, epoch_s: np.ndarray, least: int = 8
 ) -> Blocks:
-    """Group increments by epoch, splitting those that an epoch falls into.
+    """Group increments by epoch, splitting those that contain an epoch.
 
-    A split increment is shared in proportion to time, at a constant rate within it; the second
-    part's velocity increment is turned into the body axes at its own start.
+    A split increment is divided in proportion to time, at a constant rate within it; the second
+    part's velocity increment is rotated into the body axes at its own start.
 
     Args:
         increments: N increments; dt (N,), theta (N, 3), dv (N, 3). Displacements are not used: a
-            piece moves as under a constant force, which is exact to the order of the rest.
+            piece is taken to have constant specific force, to the order of the other terms.
         time_s: (N,) end of each increment; it begins at ``time_s - dt``.
         start_s: beginning of the first block.
         epoch_s: (E,) end of each block, increasing.
@@ -143,12 +144,12 @@ def reach_of_rate(usual_s: float) -> float:
 def rate_about(
     increments: Increments, time_s: np.ndarray, at_s: np.ndarray, usual_s: float | None = None
 ) -> np.ndarray:
-    """(E, 3) rad/s, gyro rate about times: mean over the increments that end within 10 ms of each.
+    """Gyro rate (E, 3) [rad/s] at given times: mean over the increments that end within 10 ms.
 
     Args:
         increments: dt (N,), theta (N, 3).
         time_s: (N,) end of each.
-        at_s: (E,) times.
+        at_s: (E,) times [s].
         usual_s: s, sampling interval; None: the median of dt.
     """
     dt, theta = increments[:2]
@@ -167,10 +168,10 @@ def rate_about(
 def gained_in_window(
     increments: Increments, time_s: np.ndarray, at_s: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity gained from the average instant of a window to its end.
+    """Mean velocity gained over a window up to its end.
 
-    The mean over the window (t - T, t] of v(t) - v(s) is the integral of the specific force with a
-    weight that grows from 0 at t - T to 1 at t, seen in the body axes at t.
+    The mean over s in (t - T, t] of v(t) - v(s) is the integral of the specific force with a weight
+    that grows from 0 at t - T to 1 at t, in the body axes at t.
 
     Args:
         increments: dt (N,), theta (N, 3), dv (N, 3).
@@ -179,8 +180,8 @@ def gained_in_window(
         window_s: length T; 0 for none.
 
     Returns:
-        (E, 3) m/s, gravity not taken out, and (E,) the integral of the weight, T/2 where the
-        samples cover the window.
+        Gain (E, 3) [m/s] of specific force, gravity not included, and integral of the weight (E,)
+        [s], T/2 if the samples cover the window.
     """
     gained, age = np.zeros((len(at_s), 3)), np.zeros(len(at_s))
     if window_s <= 0.0:
@@ -197,7 +198,7 @@ def gained_in_window(
             return gained, age
         share = length / increments.dt[k]
         weight = 1.0 - (at_s - 0.5 * (begin + end)) / window_s
-        # dv is in the axes at the start of its interval, so the turn over the interval comes first
+        # dv is in the axes at the start of its interval, so its rotation comes first
         turn = turn * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
         gained += (weight * share)[:, None] * turned(turn.as_matrix(), increments.dv[k])
         age += weight * length

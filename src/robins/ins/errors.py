@@ -1,4 +1,4 @@
-"""Error dynamics of the strapdown mechanisation: how small errors of a state grow.
+"""Linear error dynamics of the strapdown mechanisation.
 
 The error x is that of `robins.manifold`: true = retract(estimate, x). In tangent order
 
@@ -8,8 +8,9 @@ The error x is that of `robins.manifold`: true = retract(estimate, x). In tangen
     d(bias)   rad/s and m/s^2, gyro and accelerometer, in body axes
     d(scale)  -        gyro and accelerometer, where the state has them
 
-and ``dx/dt = F x + G w``. As Groves (2013), section 14.2, but in metres, where the position block
-is not -omega_en x, for the radii go with the estimate; and gravity enters with its own gradient.
+and ``dx/dt = F x + G w``. As in Groves (2013), section 14.2, but with position in metres,
+where the position block is not -omega_en x, since the radii are those at the estimate; and with the
+full gradient of gravity.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ def error_dynamics(
         state: a `Nav` (n = 9) or an `InsState` (n = 15, or up to 21 with scale factors).
         f_b: true specific force [m/s^2], that is, corrected for the state's biases and scales.
         omega_ib_b: true angular rate [rad/s], likewise.
-        noise: an `InsNoise`, for the decay of the biases; without it they stay.
+        noise: an `InsNoise`, for the decay of the biases; None: they are constant.
 
     Returns:
-        F, and G for unit white noise of each gyro, each accelerometer (in the sense of errors of
-        the sensor), then the drive of each bias and scale: m = 6 for a `Nav`, else n - 3.
+        F, and G for unit white noise of each gyro and accelerometer (with the sign of a sensor
+        error), then of the drive of each bias and scale: m = 6 for a `Nav`, else n - 3.
     """
     C = state.q_nb.as_dcm()
     F_nav = frame_dynamics(state).at[3:6, 0:3].set(-skew(C @ f_b))
     zero = jnp.zeros((3, 3))
     kinds = [("gyro", 0, omega_ib_b), ("accel", 3, f_b)]
-    into = {}  # how the errors of a sensor enter the nine
+    into = {}  # effect of the errors of a sensor on the nine
     for sensor, at, _ in kinds:
         blocks = [zero, zero, zero]
         blocks[at // 3] = -C / (1.0 + scale_of(state, sensor))[None]
@@ -68,14 +69,14 @@ def error_dynamics(
 
 
 def frame_dynamics(state: Any) -> Float[Array, "9 9"]:
-    """F of attitude, velocity and position in free fall: all of it that no sensor decides."""
+    """F of attitude, velocity and position in free fall: the part that needs no sensor data."""
     v, lat, alt = state.v_n, state.position.lat, state.position.alt
     s, c = jnp.sin(lat), jnp.cos(lat)
     t = s / c
     w_sq = 1.0 - E2 * s * s
     transverse = A_M / jnp.sqrt(w_sq)
     meridian = transverse * (1.0 - E2) / w_sq
-    # radii at height, and what they grow by per radian of latitude
+    # radii at height, and their derivatives by latitude
     n, e = meridian + alt, transverse + alt
     n_lat, e_lat = 3.0 * meridian * E2 * s * c / w_sq, transverse * E2 * s * c / w_sq
     north, east, down = v[0], v[1], v[2]
@@ -125,7 +126,7 @@ def frame_dynamics(state: Any) -> Float[Array, "9 9"]:
 
 
 def scale_of(state: Any, sensor: str) -> Any:
-    """Scale factor errors of a sensor; zero where the state has none."""
+    """Scale factor errors of a sensor; zero if they are not states."""
     scale = getattr(state, f"{sensor}_scale", None)
     return jnp.zeros(3) if scale is None else scale
 

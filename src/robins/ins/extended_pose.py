@@ -10,7 +10,7 @@ element is the matrix
         [0 0 1]
 
 with J the left Jacobian of the rotations. In these coordinates the error of strapdown navigation
-moves by a linear law that does not depend on the path, however large the error (`ins.invariant`).
+obeys a linear law independent of the trajectory, however large the error (`ins.invariant`).
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class ExtendedPose:
 
     ``error`` is the side of the error:
 
-    - "right" invariant: ``true = exp(xi) estimate``, xi seen in the frame the attitude maps *to*.
-      Its attitude part is the package's own error, ``C_true = exp(phi x) C``.
-    - "left" invariant: ``true = estimate exp(xi)``, xi seen in the body.
+    - "right" invariant: ``true = exp(xi) estimate``, xi in the frame the attitude maps *to*. Its
+      attitude part is the error of `robins.rotation`, ``C_true = exp(phi x) C``.
+    - "left" invariant: ``true = estimate exp(xi)``, xi in body axes.
     """
 
     rotation: Rotation  # body to navigation
@@ -56,7 +56,7 @@ class ExtendedPose:
 
     @classmethod
     def identity(cls, error: Side = "right") -> ExtendedPose:
-        """Pose at the origin, at rest, unturned."""
+        """Identity: zero rotation, velocity and position."""
         return cls(Rotation.identity(), jnp.zeros(3), jnp.zeros(3), error)
 
     @classmethod
@@ -68,7 +68,7 @@ class ExtendedPose:
         return cls(Rotation.from_rotvec(phi), velocity, position, error)
 
     def log(self) -> Float[Array, "*b 9"]:
-        """The xi, of attitude part at most pi, with ``exp(xi)`` this element."""
+        """Logarithm: xi, of attitude part at most pi, for which ``exp(xi)`` is this element."""
         phi = self.rotation.as_rotvec()
         _, _, twice = turn_coefficients(phi)
         half = jnp.full_like(twice, -0.5)
@@ -85,14 +85,14 @@ class ExtendedPose:
         )
 
     def inverse(self) -> ExtendedPose:
-        """The opposite element."""
+        """Inverse element."""
         back = self.rotation.inverse()
         return ExtendedPose(
             back, -back.apply(self.velocity), -back.apply(self.position), self.error
         )
 
     def adjoint(self) -> Float[Array, "9 9"]:
-        """Ad with ``X exp(xi) = exp(Ad xi) X``: body errors as errors seen outside."""
+        """Ad with ``X exp(xi) = exp(Ad xi) X``: left-invariant errors to right-invariant ones."""
         C, zero = self.rotation.as_dcm(), jnp.zeros((3, 3))
         rows = (
             (C, zero, zero),
@@ -102,7 +102,7 @@ class ExtendedPose:
         return jnp.block([list(row) for row in rows])
 
     def retract(self, delta: Float[Array, "*b 9"]) -> ExtendedPose:
-        """The element an error of delta leads to; the quaternion is renormalised."""
+        """Element corrected by the error delta; the quaternion is renormalised."""
         step = ExtendedPose.exp(delta, self.error)
         moved = step @ self if self.error == "right" else self @ step
         wxyz = moved.rotation.wxyz
@@ -113,7 +113,7 @@ class ExtendedPose:
         """The delta for which ``self.retract(delta) == other``.
 
         Raises:
-            ValueError: the errors of the two stand on different sides.
+            ValueError: the two have errors on different sides.
         """
         if other.error != self.error:
             raise ValueError(f"a pose of {self.error} error against one of {other.error} error")

@@ -1,13 +1,13 @@
 """The two frame conventions of robins, and the conversion between them.
 
 Native are north-east-down for navigation and forward-right-down for the body (NED/FRD). East-north-
-up and right-forward-up (ENU/RFU) is the same thing relabelled: with T the half turn about (1, 1, 0)
+up and right-forward-up (ENU/RFU) differ in labels only: with T the half turn about (1, 1, 0)
 
     v_ENU = T v_NED       v_RFU = T v_FRD       C_ENU_RFU = T C_NED_FRD T'
 
-T exchanges the first two components and turns the sign of the third, so nothing is rounded, and T
-is its own inverse, so one function serves both ways. Roll, pitch and heading are those of the
-vehicle and the same in both.
+T exchanges the first two components and changes the sign of the third, so the conversion is exact,
+and T is its own inverse, so one function serves both directions. Roll, pitch and heading are those
+of the vehicle and the same in both.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ _HALF_TURN = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])  # T as a quaterni
 
 
 def swap(v):
-    """A vector (..., 3) in the other convention, NED <-> ENU or FRD <-> RFU; exact."""
+    """Convert a vector (..., 3) to the other convention, NED <-> ENU or FRD <-> RFU; exact."""
     return _turn_last(v[..., _ORDER])
 
 
 def turned(C: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) times a matrix (..., 3, 3), with the same bits alone and in any array.
+    """Vectors (..., 3) multiplied by a matrix (..., 3, 3), to the same bits alone and in any array.
 
-    A product of matrices rounds one row otherwise than many.
+    A matrix product rounds a single row differently than many.
     """
     return np.sum(C * v[..., None, :], axis=-1)
 
 
 def swap_q(q):
-    """A quaternion (..., 4) q_nb in the other convention, NED/FRD <-> ENU/RFU; exact."""
+    """Convert a quaternion q_nb (..., 4) to the other convention, NED/FRD <-> ENU/RFU; exact."""
     return _turn_last(q[..., _ORDER_Q])
 
 
@@ -62,7 +62,7 @@ def _turn_last(v):
     return v * sign.reshape((1,) * (v.ndim - 1) + sign.shape)
 
 
-_COLUMNS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {  # by the side that turns
+_COLUMNS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {  # by the converted side
     "nav": {
         "v_n": swap,
         **dict.fromkeys(("sigma_m", "sigma_v", "assumed_m", "assumed_v"), lambda s: s[..., _ORDER]),
@@ -79,8 +79,8 @@ def to_ned_frd(table: Table) -> Table:
 def to_enu_rfu(table: Table) -> Table:
     """The same table in ENU/RFU.
 
-    Exact, and there and back gives the same bits. Only attitudes that mix the conventions (such as
-    NED with RFU) round: turning one side of a quaternion takes a square root of two.
+    Exact, and a round trip gives the same bits. Only attitudes that mix the conventions (such as
+    NED with RFU) are rounded: converting one side of a quaternion needs a square root of two.
     """
     return _to(table, "ENU", "RFU")
 
@@ -115,7 +115,7 @@ def _turned(q, turn_nav: bool, turn_body: bool):
 def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:
     """Roll, pitch, heading [rad] of an ENU/RFU attitude (..., 4).
 
-    Right wing down, nose up, clockwise from north: the angles `robins.rotation.to_euler` gives for
-    the same vehicle in NED/FRD.
+    Positive right wing down, nose up, clockwise from north: the angles of
+    `robins.rotation.to_euler` for the same vehicle in NED/FRD.
     """
     return to_euler(swap_q(jnp.asarray(q_nb)))

@@ -1,24 +1,22 @@
-"""Error models of inertial sensors: what is wrong with a triad of gyros or accelerometers.
+"""Error models of triads of gyros or accelerometers.
 
-Each sample of a triad is taken to be (Groves 2013, section 4.4; Titterton & Weston 2004, chapters 4
+Each sample of a triad is modelled as (Groves 2013, section 4.4; Titterton & Weston 2004, chapters 4
 and 6)::
 
     measured = (I + S + M) true + bias + G f + noise,        then clipped, then quantised
 
 with scale factor errors S, misalignments M, and for gyros a sensitivity G to the specific force f.
-The bias is the sum of a constant that changes from one switching on to the next, a first-order
-Gauss-Markov process, a random walk and a ramp; the noise is white. This module describes, from SI
-numbers or data sheets (by grade: `grade`; from an Allan fit:
-`robins.ins.allan.triad_errors`), and gives the expected errors in closed form;
-`robins.sim.imu_sensor` draws.
+The bias is the sum of a constant that changes from turn-on to turn-on, a first-order Gauss-Markov
+process, a random walk and a ramp; the noise is white. This module defines models from SI numbers or
+data sheets (by grade: `grade`; from an Allan fit: `robins.ins.allan.triad_errors`), and gives their
+expected errors in closed form; `robins.sim.imu_sensor` simulates them.
 
 Units are SI, per axis: [y] stands for rad/s of a gyro and m/s^2 of an accelerometer.
 
-`grade` gives models by the grades of the field, for when there is no data sheet yet (Groves 2013,
-chapter 4; Titterton & Weston 2004, chapters 4 to 7). Figures are round ones from the middle of what
-such units are sold with, in the words of a data sheet, so that a reader can compare them with one.
-Within a grade products differ by a factor of three either way: take the figures of your sensor
-where you have them.
+`grade` gives models by sensor grade, for use without a data sheet (Groves 2013, chapter 4;
+Titterton & Weston 2004, chapters 4 to 7). Figures are round, typical of products, and given as in a
+data sheet, so that they can be compared with one. Within a grade products differ by a factor of
+three either way: use the figures of your sensor if you have them.
 """
 
 from __future__ import annotations
@@ -44,9 +42,9 @@ T = TypeVar("T", bound=type)
 def checked_pytree(cls: T) -> T:
     """Register a frozen dataclass as a pytree whose rebuilding skips its ``__post_init__``.
 
-    JAX rebuilds a record with tracers, batches, axis numbers and stand-ins for leaves. Checks and
-    conversions are meant for what a person writes, so they run in the constructor and in
-    ``dataclasses.replace`` alone. A field that is None is structure, not a leaf.
+    JAX rebuilds a record with tracers, batches, axis numbers and placeholders for leaves. Checks
+    and conversions are meant for user input, so they run only in the constructor and in
+    ``dataclasses.replace``. A field that is None is structure, not a leaf.
     """
     names = tuple(f.name for f in dataclasses.fields(cls))
 
@@ -76,11 +74,11 @@ FLICKER_FLAT = float(np.sqrt(2.0 * np.log(2.0) / np.pi))
 class TriadErrors:
     """Errors of three gyros or three accelerometers; None: the sensor has no such error.
 
-    Sigmas are one sigma of what is drawn in each run. A number stands for all three axes, of a
-    matrix for all elements that can differ from zero (of a given ``g_sensitivity``: the diagonal).
-    A model is a pytree: which errors there are is its structure, how large they are its leaves, so
-    models of one structure can be stacked, mapped over and traced. Values that are known are
-    checked when a model is written, not inside compiled code.
+    Sigmas are those of the values drawn in each run. A number stands for all three axes, or for all
+    elements of a matrix that can differ from zero (for ``g_sensitivity``, the diagonal). A model is
+    a pytree: the kinds of errors are its structure, their sizes its leaves, so models of one
+    structure can be stacked, mapped over and traced. Known values are checked at construction, not
+    inside compiled code.
 
     Raises:
         ValueError: a wrong shape, a value not finite, a negative sigma, a size not positive, a
@@ -88,7 +86,7 @@ class TriadErrors:
     """
 
     bias: Any = None  # (3,) [y], the same in every run
-    bias_sigma: Any = None  # (3,) [y], from one switching on to the next
+    bias_sigma: Any = None  # (3,) [y], from turn-on to turn-on
     markov_sigma: Any = None  # (3,) [y], stationary sigma of the Gauss-Markov bias
     markov_tau_s: Any = None  # (3,) s, its correlation time
     walk: Any = None  # (3,) [y]/sqrt(s), random walk of the bias, K
@@ -96,12 +94,12 @@ class TriadErrors:
     white: Any = None  # (3,) [y] sqrt(s), angle or velocity random walk, N
     scale: Any = None  # (3,) relative, the same in every run
     scale_sigma: Any = None  # (3,) relative
-    misalignment: Any = None  # (3, 3) rad, zero diagonal: axis i sees M[i, j] of axis j
+    misalignment: Any = None  # (3, 3) rad, zero diagonal: axis i measures M[i, j] of axis j
     misalignment_sigma: Any = None  # (3, 3) rad, zero diagonal
     g_sensitivity: Any = None  # (3, 3) [y]/(m/s^2), of gyros
     g_sensitivity_sigma: Any = None  # (3, 3) [y]/(m/s^2), of gyros
     full_scale: Any = None  # (3,) [y], larger magnitudes are clipped
-    quantum: Any = None  # (3,) [y] s, one count of the increments; the rest is carried over
+    quantum: Any = None  # (3,) [y] s, one count of the increments; the remainder is carried over
 
     def __post_init__(self):
         for name in _FIELDS:
@@ -113,7 +111,7 @@ class TriadErrors:
 @checked_pytree
 @dataclass(frozen=True, eq=False)
 class ImuErrorModel:
-    """Errors of an inertial measurement unit: those of its gyros and of its accelerometers.
+    """Errors of the gyros and accelerometers of an inertial measurement unit.
 
     Raises:
         ValueError: accelerometers with a g-sensitivity (theirs is the scale factor).
@@ -139,7 +137,7 @@ class ImuErrorModel:
 
         Each figure is a text, or three of them for the three axes:
 
-        - ``bias``: one sigma from one switching on to the next (repeatability);
+        - ``bias``: one sigma from turn-on to turn-on (repeatability);
         - ``bias_instability``, the lowest point of the Allan deviation, with ``correlation_time``:
           a Gauss-Markov process whose Allan deviation peaks at that figure;
         - ``noise``: angle or velocity random walk, or the density (``arw`` and ``vrw`` also do);
@@ -149,7 +147,7 @@ class ImuErrorModel:
 
         Raises:
             ValueError: an unknown or repeated figure; an instability without correlation time.
-            robins.units.UnitError: a figure without unit or with that of something else.
+            robins.units.UnitError: a figure without unit or with one of another kind.
         """
         return cls(_from_figures("gyro", gyro or {}), _from_figures("accel", accel or {}))
 
@@ -183,7 +181,7 @@ def _checked(name: str, value: Any) -> Any:
 
 
 def _pattern(name: str) -> Any:
-    """Elements a single number stands for."""
+    """Elements of a field that a single number sets."""
     if name.startswith("misalignment"):
         return np.ones((3, 3)) - np.eye(3)
     return np.eye(3) if name == "g_sensitivity" else 1.0
@@ -257,11 +255,11 @@ def allan_deviation(errors: TriadErrors, tau_s: ArrayLike | float) -> np.ndarray
 
 
 def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
-    """One sigma (3,) of the bias of a mean over a stated time, from all runs.
+    """One sigma (3,) of the error of a mean over a stated time at rest, over runs.
 
-    What is left in the mean of a sensor at rest: the constant bias, the Gauss-Markov bias averaged,
-    the random walk (from zero at the start of the mean), the white noise averaged and one
-    quantisation step at either end; a given ``bias`` and ``ramp`` are no chance and not counted.
+    It includes the turn-on bias, the averaged Gauss-Markov bias, the random walk (from zero at the
+    start of the mean), the averaged white noise and one quantisation step at either end; the
+    deterministic ``bias`` and ``ramp`` are not included.
 
     Raises:
         ValueError: a duration that is not positive.
@@ -286,8 +284,8 @@ def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
 # navigation: ring laser gyros and force-feedback pendulums of an airliner's inertial reference,
 # about one nautical mile per hour unaided, which is what 0.01 deg/h and 50 ug amount to. tactical:
 # fibre-optic gyros and quartz accelerometers of guided munitions and survey systems. industrial
-# MEMS: factory-calibrated modules, steady while on, a new bias at each switching on. consumer MEMS:
-# one-chip sensors of telephones and drones, not calibrated one by one.
+# MEMS: factory-calibrated modules, stable while on, with a new bias at each turn-on. consumer MEMS:
+# single-chip sensors of telephones and drones, not individually calibrated.
 _GRADES = ("navigation", "tactical", "industrial MEMS", "consumer MEMS")
 _TABLE = {
     "gyro": {

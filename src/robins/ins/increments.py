@@ -1,30 +1,30 @@
 """IMU samples to increments: rotation and velocity increment of the body over each interval.
 
 An `Increments` row describes the motion of the body relative to inertial space between two times,
-in body axes at the earlier one: rotation vector, velocity increment and displacement, with coning,
-sculling and scrolling in them. The samples do not show how rate and specific force ran
-inside an interval. One rule for each kind of sensor fills that in:
+in body axes at the earlier one: rotation vector, velocity increment and displacement, corrected for
+coning, sculling and scrolling. The samples do not show rate and specific force inside an interval;
+they are interpolated by a rule for each kind of sensor:
 
-*increment*: both ran linearly, with the slope that the previous sample shows. For equal intervals
+*increment*: both are linear, with the slope given by the previous sample. For equal intervals
 the coning term is then a 12th of (previous x this), that of Ignagni (1996) and Savage (1998, part
-1), and sculling goes likewise (part 2). Causal. The error of a path is of third order in the
+1), and likewise for sculling (part 2). Causal. The error of a path is of third order in the
 interval; a cone of half angle a at rate W, sampled every T, leaves a drift of a^2 x^5 / (60 T),
-x = W T (Ignagni 1996). After lost samples the same line runs from the middle of the previous
-sample's own interval to that of this one's (`robins.ins.increments`).
+x = W T (Ignagni 1996). After lost samples the line runs from the middle of the previous sample's
+own interval to the middle of the present one's (`own_intervals`).
 
-*rate*: both ran along the cubic through the four nearest samples. Fourth order; needs one sample
-ahead. Where there are fewer than four, or their intervals differ by more than a factor of two, both
-ran along the straight line between two samples: second order.
+*rate*: both follow the cubic through the four nearest samples. Fourth order; needs one sample
+ahead. If there are fewer than four, or their intervals differ by more than a factor of two, both
+follow the straight line between two samples: second order.
 
 The integrals are then taken by the Gauss rule of two points, with the rotation at each point in
 closed form: exact in every product of the linear model up to the third order, of fourth order
 beyond (Iserles & Norsett 1999 for the rotation vector). All is NumPy over whole tables.
 
-`own_intervals` finds missing samples, and the time over which the sample after a gap was
-taken. An increment is the integral since the sample before it. Where that one was lost, most
-sensors have put out the integral of their own interval only, and the motion of the others is lost
-with them; some go on summing up and have the motion of the whole gap. Stamps cannot separate the
-two cases, but rate and specific force can: the one that fits those of the sample before is true.
+`own_intervals` finds missing samples, and the interval over which the sample after a gap was
+integrated. An increment is the integral since the previous sample. If that one was lost, most
+sensors output the integral over their own interval only, so the motion of the lost samples is
+missing; others keep summing and include the motion of the whole gap. Stamps cannot separate the two
+cases, but rate and specific force can: the case closer to the previous sample is assumed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from robins.errors import require, require_kind
 from robins.ins.frames import to_ned_frd
 from robins.rotation import from_rotvec, multiply, normalise, rotate, to_rotvec
 
-_EVEN = 2.0  # largest ratio of neighbouring intervals that a cubic is drawn through
+_EVEN = 2.0  # largest ratio of neighbouring intervals for a cubic
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
 
@@ -56,22 +56,23 @@ class Increments(NamedTuple):
     dt: Any  # (N,) s
     theta: Any  # (N, 3) rad, rotation vector of the body relative to inertial space
     dv: Any  # (N, 3) m/s, integral of specific force
-    dr: Any = None  # (N, 3) m, its double integral; None: as of a constant force in a turning body
+    dr: Any = None  # (N, 3) m, its double integral; None: for constant force in the turning body
 
 
 def from_imu(imu: ImuTable, usual_s: float | None = None) -> tuple[Increments, np.ndarray]:
-    """Increments of the intervals between samples, and the time each interval ends at.
+    """Increments of the intervals between samples, and the end of each interval [ns].
 
     N samples make N - 1 intervals, from ``imu.time_ns[0]`` to ``imu.time_ns[-1]``. The first row of
-    an increment table belongs to an interval that began before the table; it only shows the slope
+    an increment table belongs to an interval that began before the table; it only gives the slope
     for the second, and is taken to be as long as that.
 
     Args:
         imu: the samples.
-        usual_s: s, sampling interval of the sensor, for a table too short to show it; None: shown.
+        usual_s: s, sampling interval of the sensor, for a table too short to show it; None: found
+            from the table.
 
     Raises:
-        TypeError: it is no table of an IMU.
+        TypeError: the table is not one of an IMU.
         ValueError: fewer than two samples, time that does not increase, a value that is not finite.
     """
     require_kind(imu, ImuTable, "from_imu")
@@ -115,13 +116,13 @@ def _row(imu: ImuTable, k: int) -> str:
 
 
 def _from_increments(dt, gyro, accel, usual_s):
-    """The line through the mean before and the mean at the end of each interval, at Gauss points.
+    """Line through the means of the previous and the present interval, at the Gauss points.
 
-    Without a gap, a sample lasted as long as its interval, whose mean it has.
+    Without a gap, a sample is the integral over its interval.
     """
     h = dt[:, None]
     own = own_intervals(dt, gyro, accel, usual_s)[:, None]
-    middle = 1.0 - 0.5 * own[1:] / h  # of the sample's own interval, in lengths of this one
+    middle = 1.0 - 0.5 * own[1:] / h  # middle of the sample's own interval, in units of h
     points = []
     for raw in (gyro, accel):
         mean = raw / own
@@ -139,7 +140,7 @@ def _from_rates(dt, gyro, accel):
 def _stencil(dt):
     """Four samples for each interval (4, N), and their weights for its two Gauss points.
 
-    The interval is the middle one of the three between them, at the ends of the table an outer one.
+    The interval is the middle one of the three between them; an outer one at the table's ends.
     """
     n = len(dt)
     first = np.clip(np.arange(n) - 1, 0, max(n - 3, 0))
@@ -182,29 +183,29 @@ def _cross(a, b):
 
 
 def _turned(phi, v):
-    """Vectors v turned by rotation vectors phi (Rodrigues)."""
+    """Rotate vectors v by rotation vectors phi (Rodrigues)."""
     sq = np.einsum("ni,ni->n", phi, phi)[:, None]
-    # sin(p)/p and (1 - cos(p))/p^2; np.sinc(x) is sin(pi x)/(pi x) and knows its limit
+    # sin(p)/p and (1 - cos(p))/p^2; np.sinc(x) is sin(pi x)/(pi x), with its limit at 0
     p = np.sqrt(sq) / np.pi
     turn = _cross(phi, v)
     return v + np.sinc(p) * turn + 0.5 * np.sinc(0.5 * p) ** 2 * _cross(phi, turn)
 
 
 def displacement(increments: Increments) -> Any:
-    """``dr`` [m], or what it is for a specific force constant in the turning body."""
+    """Displacement ``dr`` [m]; if None, that of a constant specific force in the turning body."""
     dt, theta, dv, dr = increments
     return dt[..., None] * (dv / 2.0 - _cross(theta, dv) / 12.0) if dr is None else dr
 
 
-_MISSING = 1.5  # usual intervals; from here on at least one sample is missing
-_SPAN = 8  # intervals that are measured together, so that bursts of stamps average out
-_GRAVITY = 9.8  # m/s^2 that counts as much as 1 rad/s
+_MISSING = 1.5  # usual intervals; in a longer one at least one sample is missing
+_SPAN = 8  # intervals averaged together, against bursts of stamps
+_GRAVITY = 9.8  # m/s^2 weighted like 1 rad/s
 
 
 def usual_interval(dt: np.ndarray) -> float:
-    """The interval [s] of a sensor from those between its samples (N,), of which some are missing.
+    """Sampling interval [s] of a sensor, from intervals (N,) between samples with some missing.
 
-    Their median, unless stamps come in bursts: then a tenth percentile of the means over eight.
+    The median, or, if stamps come in bursts, the tenth percentile of means over eight.
     """
     span = min(_SPAN, len(dt))
     ends = np.concatenate([[0.0], np.cumsum(dt)])
@@ -214,9 +215,9 @@ def usual_interval(dt: np.ndarray) -> float:
 
 
 def after_gap(dt: np.ndarray, usual_s: float | None = None) -> np.ndarray:
-    """(N,) bool: whether samples are missing in an interval, from the intervals (N,) [s].
+    """Mask (N,) of the intervals (N,) [s] in which samples are missing.
 
-    A long interval with a short one behind it is a late stamp: nothing is missing there. The usual
+    A long interval followed by a short one is a late stamp: no sample is missing there. The usual
     interval is that of `dt` unless it is given.
     """
     usual = usual_interval(dt) if usual_s is None else usual_s
@@ -251,12 +252,11 @@ def own_intervals(
 
 
 def joined(increments: Increments) -> Increments:
-    """One increment for K in a row: dt (), theta, dv and dr (3,), by
+    """Join K successive increments into one: dt (), theta, dv and dr (3,), by
 
         q <- q exp(theta_k)     dr <- dr + dv dt_k + C(q) dr_k     dv <- dv + C(q) dv_k
 
-    Exact, but that a turn of the whole interval has to be less than one of pi; `jax.vmap` joins
-    many intervals.
+    Exact, if the total rotation is less than pi; `jax.vmap` joins many intervals.
 
     Args:
         increments: K of them, leading axis, with dr or without.

@@ -6,16 +6,16 @@ with increments theta, dv, dr in body axes the true state and its estimate both 
     X' = Gamma Phi(X) Upsilon,   Gamma = (I, g dt, g dt^2 / 2),   Upsilon = (exp(theta x), dv, dr)
 
 and Phi, position += velocity dt, respects the group product. So with exact increments the error
-moves by a law that knows neither the path nor its own size (Barrau & Bonnabel 2017, theorem 2):
+obeys a law independent of the trajectory and of its own size (Barrau & Bonnabel 2017, theorem 2):
 
     right:  xi' = Ad(Gamma) Phi xi            left:  xi' = Ad(Upsilon)^-1 Phi xi
 
 On this state `kalman(taylor(), rules)` *is* the invariant filter. With biases in the state the law
 holds in the navigation part only (the "imperfect" filter of Barrau 2015, sec. 7.3).
 
-The frame is local-level NED, fixed to the ground, body FRD. Gravity is constant, and the turning of
-the Earth and of the frame over it are left out: 15 deg/h, and 1.5e-4 m/s^2 a m/s of speed. That
-suits sensors of 10 deg/h and worse over kilometres and minutes; `robins.ins.state` has the rest.
+The frame is local-level NED, fixed to the ground, body FRD. Gravity is constant, and Earth rate and
+transport rate are neglected: 15 deg/h, and 1.5e-4 m/s^2 per m/s of speed. That suits sensors of
+10 deg/h and worse over kilometres and minutes; `robins.ins.state` includes them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from robins.rotation import Rotation, left_jacobian, skew
 GRAVITY = 9.80665  # m/s^2, down
 
 Vector = Any  # three numbers
-Sigma = Any  # a number, or one each axis
+Sigma = Any  # a number, or one per axis
 
 
 class InvariantState(NamedTuple):
@@ -49,18 +49,18 @@ class InvariantState(NamedTuple):
 
     @classmethod
     def start(cls, pose: ExtendedPose) -> InvariantState:
-        """State at a pose, with sensors believed perfect."""
+        """State at a pose, with zero biases."""
         return cls(pose, jnp.zeros(3), jnp.zeros(3))
 
 
 def propagate(
     x: InvariantState, increment: Increments, gravity: Vector = (0.0, 0.0, GRAVITY)
 ) -> InvariantState:
-    """Move over one increment (scalar ``dt``), less the biases.
+    """Propagate over one increment (scalar ``dt``), corrected for the biases.
 
     Args:
         x: at the start of the interval.
-        increment: as measured, in body axes at the start; without ``dr`` half of ``dv dt``.
+        increment: as measured, in body axes at the start; ``dr`` None: half of ``dv dt``.
         gravity: (3,) m/s^2, navigation axes.
     """
     g = jnp.asarray(gravity, float)
@@ -71,19 +71,19 @@ def propagate(
 def transition(
     x: InvariantState, increment: Increments, gravity: Vector = (0.0, 0.0, GRAVITY)
 ) -> tuple[InvariantState, Float[Array, "15 15"], Float[Array, "15 6"]]:
-    """`propagate`, and how errors go through it.
+    """`propagate`, with its transition matrices.
 
     Returns:
-        The new state; F of the errors; and how small errors of the angle [rad] and the velocity
-        increment [m/s] enter, as does the noise of the sensors: the latter spread over the
-        interval, so that half of it times dt is position.
+        The new state; F of the errors; and G of errors of the rotation [rad] and the velocity
+        increment [m/s], such as sensor noise, the latter spread over the interval, so that half of
+        it times dt is position.
     """
     g = jnp.asarray(gravity, float)
     dt, step = _less_biases(x, increment)
     coasted = _coasted(x.pose, dt, g)
     moved = coasted @ step
     drift = jnp.eye(9).at[6:9, 3:6].set(dt * jnp.eye(3))
-    # An error of the increments is Upsilon_true Upsilon^-1 = exp(slip), seen before the step.
+    # An error of the increments is Upsilon_true Upsilon^-1 = exp(slip), in axes before the step.
     turn = left_jacobian(step.rotation.as_rotvec())
     zero, eye, half = jnp.zeros((3, 3)), jnp.eye(3), 0.5 * dt * jnp.eye(3)
     rows = [[turn, zero], [skew(step.velocity) @ turn, eye], [skew(step.position) @ turn, half]]
@@ -100,7 +100,7 @@ def transition(
 
 
 def invariant_motion(noise: InsNoise, gravity: Vector = (0.0, 0.0, GRAVITY)) -> Motion:
-    """Motion of an `InvariantState`, driven by one `Increments` a step.
+    """Motion of an `InvariantState`, driven by one `Increments` per step.
 
     Biases are random walks: time constants and scale factors of the noise are not used.
 
@@ -134,7 +134,7 @@ def position_sensor(sigma: Sigma, lever_b: Vector = (0.0, 0.0, 0.0), name="posit
     """Position [m] in the navigation frame of a point at ``lever_b`` [m] in the body.
 
     A left-invariant observation: with a pose of left error its Jacobian is (J, 0, C), and with one
-    sigma for all axes the gain seen in the body does not depend on the attitude believed.
+    sigma for all axes the gain in body axes does not depend on the estimated attitude.
     """
     return Sensor(Partial(_read_position, _each(lever_b)), _each(sigma), 3, name)
 
@@ -165,7 +165,7 @@ def _read_landmark(point: Array, x: InvariantState, aux: Data) -> Array:
 
 
 def direction_sensor(sigma: Sigma, direction: Vector, name: str = "direction") -> Sensor:
-    """A known direction of the navigation frame (north, the sun) seen in the body; no unit.
+    """Sensor of a known direction of the navigation frame (north, the sun) in body axes; unitless.
 
     Right-invariant, as `landmark_sensor`.
     """
@@ -177,7 +177,7 @@ def _read_direction(way: Array, x: InvariantState, aux: Data) -> Array:
 
 
 def _less_biases(x: InvariantState, increment: Increments) -> tuple[Array, ExtendedPose]:
-    """The length of an interval, and Upsilon."""
+    """Duration of an interval, and Upsilon corrected for the biases."""
     dt = jnp.asarray(increment.dt, float)
     theta, dv = jnp.asarray(increment.theta, float), jnp.asarray(increment.dv, float)
     dr = 0.5 * dv * dt if increment.dr is None else jnp.asarray(increment.dr, float)

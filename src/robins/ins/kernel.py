@@ -1,13 +1,13 @@
 """Small steps as one CPU kernel.
 
 A strapdown step is three hundred scalar operations. XLA's CPU back end cuts such a graph into some
-twenty kernels; starting them costs several times what they compute, and each computes again what it
+twenty kernels; starting them costs several times the computation, and each repeats the work it
 shares with the others. XLA itself compiles small loops in one piece and marks them for that with an
 attribute. `one_kernel` sets the same mark on a function: measured, 0.27 us instead of 2 us a step.
 
-The mark is a hint about speed, not about results. It is set on the CPU only, for one run at a time
-only (a batch gives each kernel enough to do), and not under differentiation; a version of XLA that
-does not know it compiles as it always did.
+The mark affects speed, not results. It is set only on the CPU, for a single run (a batch gives each
+kernel enough work), and not under differentiation; a version of XLA that does not know it ignores
+it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def one_kernel(f: Callable[..., Array]) -> Callable[..., Array]:
     """Request one CPU kernel for `f`, a function of float arrays.
 
     `f` must consist of element-wise operations, reductions and slices of small arrays: matrix
-    products, linear algebra, scatters and callbacks need what only a kernel of their own is given.
-    Let it return one array (see `pack`), else each result computes the shared work again.
+    products, linear algebra, scatters and callbacks need kernels of their own. It should return
+    one array (see `pack`), else each result repeats the shared work.
     """
     compiled = jax.jit(f)
 
@@ -56,10 +56,10 @@ def one_kernel(f: Callable[..., Array]) -> Callable[..., Array]:
 
 
 def pack(scalars: Sequence[Array]) -> Float[Array, "n"]:
-    """The scalars as one vector.
+    """Stack scalars into one vector.
 
-    `jnp.stack` in effect. Written as a selection it is one element-wise operation, so that the
-    compiler sees one user of everything the scalars share and computes that once.
+    Equivalent to `jnp.stack`, but written as a selection, a single element-wise operation, so that
+    the compiler computes shared work once.
     """
     at = lax.iota(jnp.int32, len(scalars))
     packed = jnp.broadcast_to(scalars[-1], at.shape)

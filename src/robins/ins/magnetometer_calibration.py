@@ -1,28 +1,27 @@
-"""Hard and soft iron of a magnetometer from samples taken while it was turned about.
+"""Hard and soft iron of a magnetometer from samples taken during rotations.
 
-Wherever the sensor points, the Earth's field has the same size F, so what it should read lies on a
-sphere and what it does read, ``z = A b + h + noise``, on an ellipsoid. `calibrate` finds
+In any orientation the Earth's field has the same magnitude F, so the true field b lies on a sphere
+and the reading, ``z = A b + h + noise``, on an ellipsoid. `calibrate` finds
 
     b = W (z - h),   W symmetric, |b| = F
 
-The size alone does not show a rotation of the sensor's axes, so that of A stays: W is the symmetric
-root ``(A A')^(-1/2)`` (Renaudin, Afzal & Lachapelle 2010, "Complete triaxis magnetometer
-calibration in the magnetic domain"). Unless F is given W has determinant one and F is estimated.
+The magnitude does not show a rotation of the sensor's axes, so that in A remains: W is the
+symmetric root ``(A A')^(-1/2)`` (Renaudin, Afzal & Lachapelle 2010, "Complete triaxis magnetometer
+calibration in the magnetic domain"). Unless F is given, W has determinant one and F is estimated.
 
-The fit starts from the ellipsoid of least squares in its coefficients, which cannot become another
+The fit starts from the least-squares ellipsoid in its coefficients, which cannot become another
 quadric (Li & Griffiths 2004, "Least squares ellipsoid specific fitting"), and then minimises
 Huber's loss of the distance of each sample to the ellipsoid, to first order
 ``(|W (z - h)| - F) / |W u|`` with u the direction of b, less the bias of noise by curvature: with
-normal noise, equal on the three axes, that is maximum likelihood, and single disturbed samples
-hardly count. Fields that are disturbed in the same way for long do: turn the sensor well away from
-iron.
+normal noise, equal on the three axes, that is maximum likelihood, and single disturbed samples have
+little weight. Lasting disturbances do have weight: turn the sensor well away from iron.
 
-Where the directions do not determine an ellipsoid, a sphere is fitted, the hard iron alone, which
-needs fewer of them; a turn about one axis determines neither and is refused.
+If the directions do not determine an ellipsoid, a sphere is fitted, for hard iron only, which needs
+fewer of them; a rotation about one axis determines neither and is refused.
 
-A vehicle that cannot tilt turns about the vertical only. There the same fit in the plane gives the
-two horizontal axes, an ellipse on which the horizontal field has one size; the vertical axis stays
-as it reads, so a hard iron along it shows as soon as the vehicle tilts.
+A vehicle that cannot tilt turns about the vertical only. The same fit in the plane then calibrates
+the two horizontal axes, by an ellipse of constant horizontal field; the vertical axis stays
+uncalibrated, so hard iron along it causes errors as soon as the vehicle tilts.
 """
 
 from __future__ import annotations
@@ -35,59 +34,59 @@ from scipy.spatial import KDTree
 from robins.errors import RobinsError
 
 FEWEST = 50  # samples
-MOST = 20_000  # that are used, spread evenly over the log; neighbours add hardly any information
-_ENDS = (0.2, 99.8)  # per cent between which the samples' extent is taken, against single spikes
-_SIDE, _SHARE = 0.15, 20  # cubes of that part of the extent count for so many samples at most
-_HUBER = 1.345  # of the noise; the estimates of normal noise keep 95 % of their efficiency
-_VAGUE = 0.1  # of the field, one sigma: what is known no better is not known
-_STRETCHED = 2.0  # axes of the ellipsoid; more is soft iron only if the samples lie on it
-_NEEDLE = 20.0  # axes; more is no ellipsoid that a fit could settle on
-_OFF = 0.1  # of the field, RMS: a surface that samples are further from than that is not theirs
-_FLAT = 0.08  # of the extent along the widest axis; less along the narrowest is a plane
-_REACH = np.deg2rad(30.0)  # of a sample, for the share of directions that are covered
-_PASSES, _SETTLED = 200, 1e-8  # of the extent; far below the resolution of any log
+MOST = 20_000  # samples used, evenly over the log; neighbours add hardly any information
+_ENDS = (0.2, 99.8)  # percentiles that define the extent of the samples, against single spikes
+_SIDE, _SHARE = 0.15, 20  # edge of a cube, in extents; most samples used of a cube
+_HUBER = 1.345  # in sigmas of the noise; 95 % efficiency for normal noise
+_VAGUE = 0.1  # of the field, one sigma; a less certain result is not determined
+_STRETCHED = 2.0  # ratio of axes; a larger one must fit the samples well
+_NEEDLE = 20.0  # ratio of axes; the fit does not converge beyond
+_OFF = 0.1  # of the field, RMS distance; a surface further from the samples does not fit
+_FLAT = 0.08  # ratio of the narrowest to the widest extent; less is a plane
+_REACH = np.deg2rad(30.0)  # about a sample, for the share of directions covered
+_PASSES, _SETTLED = 200, 1e-8  # iterations; step, in extents, far below the resolution of any log
 _NO_ELLIPSOID = (
     "the samples lie on no ellipsoid: the field was not the same while the sensor was turned, or "
     "it was turned too little; turn it away from iron, so that each of its axes points up and down "
     "once"
 )
-_TILTED = 0.2  # of the horizontal field, scatter of the vertical one
-# The numbers of a symmetric matrix by its size, and where those of the horizontal one belong.
+_TILTED = 0.2  # scatter of the vertical field, in horizontal fields
+# Elements of a symmetric matrix by its size, and indices of those of the horizontal one.
 _PAIRS = {2: ((0, 0), (1, 1), (0, 1)), 3: ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))}
 _HORIZONTAL = [0, 1, 3, 4, 8]  # of offset, then matrix
 
 
 class CalibrationError(RobinsError, ValueError):
-    """Samples from which no calibration follows."""
+    """Samples that do not determine a calibration."""
 
 
 class Calibration(NamedTuple):
-    """Result of `calibrate`. Sigmas are of the noise and allow for its correlation in time.
+    """Result of `calibrate`. Sigmas are due to noise, including its correlation in time.
 
-    Fields that differ from place to place, as they do indoors, come on top: there two logs differ
-    by more than the sigmas.
+    Fields that vary from place to place, as indoors, are not included: there two logs differ by
+    more than the sigmas.
     """
 
     offset_t: np.ndarray  # (3,) h, hard iron
     matrix: np.ndarray  # (3, 3) W, symmetric
-    soft_iron: bool  # whether W was found; else it is a multiple of the identity
-    field_t: float  # F, size of the field
+    soft_iron: bool  # W was fitted; else it is a multiple of the identity
+    field_t: float  # F, magnitude of the field
     offset_sigma_t: np.ndarray  # (3,)
     matrix_sigma: np.ndarray  # (3, 3)
     covariance: np.ndarray  # (9, 9) of h [T], then W: 00, 11, 22, 12, 02, 01
     noise_t: float  # of a sample along one axis, one sigma, robust
-    before_t: float  # RMS of the size of the samples about its mean, each direction alike
-    after_t: float  # RMS of the size of the calibrated samples about F
+    before_t: float  # RMS of the magnitude of samples about its mean, directions weighted equally
+    after_t: float  # RMS of the magnitude of the calibrated samples about F
     outliers: float  # share of samples further than 5 sigma from the ellipsoid
-    independent: float  # effective number of samples, if their noise were independent
+    independent: float  # effective number of samples with independent noise
     covered: float  # share of all directions within 30 deg of one of a sample
-    gap: np.ndarray  # (3,) direction of the field, sensor axes, that is furthest from any sample
-    gap_rad: float  # how far
-    level: bool = False  # the horizontal axes alone; before, after and gap are of their plane
+    gap: np.ndarray  # (3,) direction in sensor axes furthest from any sample
+    gap_rad: float  # its distance from the nearest sample
+    level: bool = False  # horizontal axes only; before, after and gap refer to their plane
 
 
 def calibrated(field_t: Any, offset_t: Any, matrix: Any) -> np.ndarray:
-    """Field (..., 3) [T] without hard and soft iron, ``W (z - h)``."""
+    """Field (..., 3) [T] corrected for hard and soft iron, ``W (z - h)``."""
     z, h, W = (np.asarray(v, float) for v in (field_t, offset_t, matrix))
     return (z - h) @ W.T
 
@@ -101,17 +100,17 @@ def calibrate(
     """Hard and soft iron of a magnetometer that was turned about all its axes, or the vertical.
 
     Args:
-        field_t: (N, 3) samples [T] in sensor axes, in order of time; rows with NaN are left out.
-        strength_t: size of the field at the place [T], e.g. of `robins.earth.magnetic`; it sets the
-            scale of the result. None: the scale is kept on average, ``det W = 1``.
-        soft_iron: whether to fit it; None: if the directions determine it.
-        level: it was turned about its third axis only, which was vertical; the other two are
-            calibrated. With a strength their scale follows from it and the vertical reading.
+        field_t: (N, 3) samples [T] in sensor axes, in order of time; rows with NaN are omitted.
+        strength_t: magnitude of the field at the place [T], e.g. from `robins.earth.magnetic`; it
+            sets the scale of the result. None: the scale is kept on average, ``det W = 1``.
+        soft_iron: True to fit it; None: if the directions determine it.
+        level: turned about its third axis only, which was vertical; the other two are calibrated.
+            With a strength, their scale follows from it and the vertical reading.
 
     Raises:
-        CalibrationError: too few samples; they lie in a plane or a part of the ellipsoid so small
-            that it does not determine the result; neither an ellipsoid nor, where soft iron is
-            None, a sphere fits; a strength that is not positive.
+        CalibrationError: too few samples; they lie in a plane or on too small a part of the
+            ellipsoid; neither an ellipsoid nor, if soft iron is None, a sphere fits; a strength
+            that is not positive.
     """
     z = np.asarray(field_t, float)
     if z.ndim != 2 or z.shape[1] != 3:
@@ -145,7 +144,7 @@ def _best(
     strength_t: float | None,
     soft_iron: bool | None,
 ) -> Calibration:
-    """The ellipsoid of samples of unit extent, or the sphere where they do not tell it."""
+    """Calibration by an ellipsoid of samples of unit extent, or by a sphere if not determined."""
     why = CalibrationError(_NO_ELLIPSOID)
     d = unit.shape[1]
     if soft_iron is not False:
@@ -173,10 +172,10 @@ def _best(
 
 
 def _level(z: np.ndarray) -> tuple[float, np.ndarray]:
-    """Usual vertical field, and the horizontal one (N, 2).
+    """Median vertical field, and the horizontal field (N, 2).
 
     Raises:
-        CalibrationError: the vertical one changes as that of a vehicle that tilts.
+        CalibrationError: the vertical field varies, so the vehicle tilts.
     """
     across = z[:, :2] - np.mean(z[:, :2], axis=0)
     horizontal = float(np.sqrt(np.mean(np.sum(across**2, axis=1))))
@@ -201,7 +200,7 @@ def _horizontal(strength_t: float, vertical_t: float) -> float:
 
 
 def _upright(found: Calibration, vertical_t: float) -> Calibration:
-    """The horizontal axes among three, of which the vertical one stays as it reads."""
+    """Embed a calibration of the horizontal axes in three, the vertical one unchanged."""
     offset, matrix, sigma = np.zeros(3), np.eye(3), np.zeros((3, 3))
     offset[:2], matrix[:2, :2], sigma[:2, :2] = found.offset_t, found.matrix, found.matrix_sigma
     covariance = np.zeros((9, 9))
@@ -219,7 +218,7 @@ def _upright(found: Calibration, vertical_t: float) -> Calibration:
 
 
 def _refuse_stretched(found: Calibration) -> None:
-    """Refuse axes that differ by much where the samples do not lie on the ellipsoid."""
+    """Refuse an elongated ellipsoid unless the samples lie on it."""
     axes = np.linalg.eigvalsh(found.matrix)
     share = found.after_t / found.field_t
     if axes[-1] > _STRETCHED * axes[0] and share > 0.5 * _OFF:
@@ -231,10 +230,10 @@ def _refuse_stretched(found: Calibration) -> None:
 
 
 def _evened(z: np.ndarray) -> np.ndarray:
-    """Samples in order of time, of each little cube no more than a share, evenly over its own.
+    """Samples in order of time, thinned evenly to at most `_SHARE` in each small cube.
 
-    A sensor that rests, as most do before and after they are turned, would else outweigh all turns
-    by samples whose common error is not noise.
+    A sensor at rest, as before and after the rotations, would otherwise outweigh them by samples
+    whose common error is not noise.
     """
     cube = np.unique(np.floor(z / _SIDE).astype(np.int64), axis=0, return_inverse=True)[1]
     order = np.argsort(cube.reshape(-1), kind="stable")
@@ -292,7 +291,7 @@ def _direct_sphere(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _of_sphere(d: int) -> np.ndarray:
-    """Free directions of a sphere: its centre, and the diagonal of W as one."""
+    """Free directions of a sphere: its centre, and a common diagonal of W."""
     free = np.eye(d + len(_PAIRS[d]), d + 1)
     free[d : 2 * d, d] = 1.0
     return free
@@ -301,14 +300,14 @@ def _of_sphere(d: int) -> np.ndarray:
 def _refined(
     z: np.ndarray, offset: np.ndarray, W: np.ndarray, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least Huber loss of the distances, by Gauss-Newton steps on reweighted squares.
+    """Minimise the Huber loss of the distances by iteratively reweighted Gauss-Newton steps.
 
     Steps are combinations of the columns of ``free`` (9, K), in the plane (5, K).
     """
     noise = _robust_sigma(_distances(z, offset, W, 0.0))
     for _ in range(_PASSES):
         distance = _distances(z, offset, W, noise)
-        noise = min(noise, _robust_sigma(distance))  # growing, it would follow a worse fit
+        noise = min(noise, _robust_sigma(distance))  # a growing scale would follow a worse fit
         clip = _HUBER * noise
         share = np.sqrt(clip / np.maximum(np.abs(distance), clip))
         J = (_jacobian(z, offset, W, distance) * share[:, None]) @ free
@@ -323,11 +322,10 @@ def _refined(
 
 
 def _distances(z: np.ndarray, offset: np.ndarray, W: np.ndarray, noise: float) -> np.ndarray:
-    """Distance (N,) of each sample to the ellipsoid, to first order, outwards.
+    """Distance (N,) of each sample to the ellipsoid, to first order, positive outwards.
 
-    Noise along a surface that is curved carries outwards, on average by half its variance times
-    the sum of the curvatures; that is taken off, or it would bend ellipsoids of which a part is
-    seen.
+    Noise along a curved surface has a mean outward distance of half its variance times the sum of
+    the curvatures; that is subtracted, as it would bias an ellipsoid sampled only in part.
     """
     b = (z - offset) @ W
     size = np.linalg.norm(b, axis=1)
@@ -337,10 +335,10 @@ def _distances(z: np.ndarray, offset: np.ndarray, W: np.ndarray, noise: float) -
 
 
 def _jacobian(z: np.ndarray, offset: np.ndarray, W: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """(N, 9) of the distances by offset and the six numbers of W; in the plane (N, 5).
+    """Jacobian (N, 9) of the distances by offset and the six elements of W; in the plane (N, 5).
 
-    Taken at the nearest points of the ellipsoid: at the samples it would have their noise in it,
-    and the products of both would not vanish on average.
+    Taken at the nearest points of the ellipsoid: at the samples its noise would correlate with that
+    of the distances, and bias the fit.
     """
     y = z - offset
     normal = y @ W @ W
@@ -369,7 +367,7 @@ def _robust_sigma(x: np.ndarray) -> float:
 
 
 def _correlation(x: np.ndarray) -> float:
-    """Samples for which one independent one counts: ``1 + 2 sum rho_k`` up to the first rho < 0."""
+    """Samples per independent one: ``1 + 2 sum rho_k`` up to the first rho < 0."""
     x = x - x.mean()
     size = 1 << (2 * len(x) - 1).bit_length()
     rho = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: len(x) // 4]
@@ -381,7 +379,7 @@ def _correlation(x: np.ndarray) -> float:
 
 
 def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
-    """The result in tesla, its covariance and how well the directions are covered."""
+    """Result in tesla, with its covariance and the coverage of directions."""
     noise = _robust_sigma(_distances(unit, offset, W, 0.0))
     distance = _distances(unit, offset, W, noise)
     clip = _HUBER * noise
@@ -389,7 +387,8 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     inside = np.mean(np.abs(distance) <= clip)
     correlated = _correlation(influence)
     J = _jacobian(unit, offset, W, distance) @ free
-    # Of an estimate with influence psi: E psi^2 / (E psi')^2, times the correlation (Huber 1981).
+    # Variance of an M-estimate of influence psi: E psi^2 / (E psi')^2, times the correlation
+    # (Huber 1981).
     spread = np.mean(influence**2) / inside**2 * correlated
     covariance = spread * free @ np.linalg.inv(J.T @ J) @ free.T
 
@@ -404,7 +403,7 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     scale[:d] *= size
     covariance = scale @ covariance @ scale.T
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    sigma[d:][sigma[d:] < 1e-12] = 0.0  # held, but for rounding
+    sigma[d:][sigma[d:] < 1e-12] = 0.0  # fixed, but for rounding
     offset_t, matrix, field_t = centre + size * offset, field * W, field * size
     _refuse_uncertain(sigma[:d], sigma[d:], field_t)
     z = centre + size * unit
@@ -441,7 +440,7 @@ def _refuse_uncertain(offset: np.ndarray, matrix: np.ndarray, field_t: float) ->
 
 
 def _coverage(directions: np.ndarray) -> tuple[float, np.ndarray, float]:
-    """Share of the sphere near a sample; the direction furthest from any, and how far [rad]."""
+    """Share of the sphere near a sample; the direction furthest from any; its distance [rad]."""
     tree = KDTree(directions)
     grid = _sphere(1000) if directions.shape[1] == 3 else _circle(1000)
     chord, _ = tree.query(grid)

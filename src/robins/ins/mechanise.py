@@ -1,9 +1,9 @@
 """Strapdown mechanisation in the local level frame, north-east-down.
 
-One step takes the increments of one interval and moves attitude, velocity and position over it
-(Savage 1998, parts 1 and 2; Groves 2013, section 5.5). Rates, gravity and Coriolis acceleration are
-taken at the middle of the interval, which a half step with the values at its start finds, so the
-error of a step is of third order in its length and that of a path of second.
+One step propagates attitude, velocity and position by the increments of one interval (Savage 1998,
+parts 1 and 2; Groves 2013, section 5.5). Rates, gravity and Coriolis acceleration are evaluated at
+the middle of the interval, found by a half step with the values at its start, so the error of a
+step is of third order in its duration and that of a path of second.
 
 The frame is not defined at the poles; `refuse_polar` refuses them before a run starts. ENU/RFU
 users convert their tables, see `robins.ins.frames`.
@@ -41,29 +41,29 @@ class Nav(NamedTuple):
     """Attitude, velocity and position: one, or many along leading axes."""
 
     q_nb: Rotation  # body FRD to navigation NED
-    v_n: Array  # (..., 3) m/s over the Earth, NED
+    v_n: Array  # (..., 3) m/s relative to the Earth, NED
     position: Geodetic
 
 
 def step(nav: Nav, inc: Increments) -> Nav:
-    """Move over one interval: ``inc.dt`` a scalar, theta, dv and dr of shape (3,).
+    """Propagate over one interval: ``inc.dt`` a scalar, theta, dv and dr of shape (3,).
 
-    An increment that is all zero returns `nav` bit for bit, so blocks may be padded with them.
+    A zero increment returns `nav` bit for bit, so blocks may be padded with them.
     """
     return unpacked(advance(vector(nav), rows(inc)))
 
 
 def step_each(nav: Nav, inc: Increments) -> Nav:
-    """Step of N states by an increment each, as `step`, in NumPy: there is nothing to compile."""
+    """Step N states by an increment each, as `step`, in NumPy: nothing is compiled."""
     p = nav.position
     columns = [*nav.q_nb.wxyz.T, *nav.v_n.T, p.lat, p.lon, p.alt]
     return unpacked(np.stack(_advanced(columns, rows(inc, np).T, np), -1))
 
 
 def mechanise(nav: Nav, increments: Increments) -> Nav:
-    """Navigate from `nav` over N increments; the N states at the ends of the intervals.
+    """Navigate from `nav` over N increments; return the N states at the ends of the intervals.
 
-    Compiled again for each N; `mechanise_chunked` is not.
+    Compiled for each N, unlike `mechanise_chunked`.
     """
     return _run(nav, increments)[1]
 
@@ -148,19 +148,19 @@ def as_trajectory(time_ns: np.ndarray, nav: Nav, source: str = "") -> Trajectory
 
 
 def vector(nav: Nav) -> Float[Array, "*b 10"]:
-    """State as the step carries it: q_nb, v_n, lat, lon, alt."""
+    """State as a vector: q_nb, v_n, lat, lon, alt."""
     p = nav.position
     lla = jnp.stack([jnp.asarray(a, float) for a in (p.lat, p.lon, p.alt)], -1)
     return jnp.concatenate([jnp.asarray(nav.q_nb.wxyz), jnp.asarray(nav.v_n), lla], -1)
 
 
 def unpacked(x: Float[Real, "*b 10"]) -> Nav:
-    """The state in a `vector`."""
+    """State from a `vector`."""
     return Nav(Rotation(x[..., :4]), x[..., 4:7], Geodetic(x[..., 7], x[..., 8], x[..., 9]))
 
 
 def rows(inc: Increments, library: ModuleType = jnp) -> Float[Real, "*b 11"]:
-    """Parts of a step that depend on the increment alone: dt, exp(theta/2), dv, dr."""
+    """Parts of a step that depend only on the increment: dt, quaternion of theta, dv, dr."""
     inc = Increments(*(None if a is None else library.asarray(a, float) for a in inc))
     half = 0.5 * inc.theta
     sq = library.sum(half * half, -1, keepdims=True)
@@ -172,7 +172,7 @@ def rows(inc: Increments, library: ModuleType = jnp) -> Float[Real, "*b 11"]:
 def _sin_cos(x):
     """Sine and cosine on [-pi/2, pi/2] to rounding.
 
-    A library call would keep the runs of a batch from being computed side by side.
+    A library call would prevent vectorisation over the runs of a batch.
     """
     sq = x * x
     return x * horner(_SIN, sq), horner(_COS, sq)
@@ -185,7 +185,7 @@ def _wrap(lon, library):
 
 @one_kernel
 def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
-    """The step, on scalars: see `robins.ins.kernel` for why."""
+    """The step, on scalars; `robins.ins.kernel` gives the reason."""
     return pack(_advanced(x, row, jnp))
 
 
@@ -199,7 +199,7 @@ def _exponential(half: list) -> tuple:
 def _advanced(x, row, library) -> list:
     """The ten components of a state after the step, from those of the state and of its row.
 
-    Each is a scalar of JAX, or a column of NumPy.
+    Each is a JAX scalar, or a NumPy column.
     """
     w, qx, qy, qz, v_north, v_east, v_down, lat, lon, alt = x
     dt, *rest = row
@@ -208,7 +208,7 @@ def _advanced(x, row, library) -> list:
     dv, dr = rotate(q, tuple(rest[4:7])), rotate(q, tuple(rest[7:]))
 
     # Latitude and height at the middle, and what depends on them. The shift in latitude is tiny
-    # (2e-7 rad at 300 m/s and 100 Hz), so two terms carry sine, cosine and the radii over.
+    # (2e-7 rad at 300 m/s and 100 Hz), so two terms suffice for sine, cosine and the radii.
     s, c = _sin_cos(lat)
     per_w_sq = 1.0 / (1.0 - E2 * s * s)
     transverse = A_M * library.sqrt(per_w_sq)
@@ -226,7 +226,7 @@ def _advanced(x, row, library) -> list:
     g_north, g_down = gravity_nd(s_mid, c_mid, transverse, alt_mid, library)
 
     def over_earth(north, east):
-        """omega_en_n, or the turn of the frame over a displacement."""
+        """omega_en_n of a velocity, or the rotation of the frame over a displacement."""
         about_north = east * per_east
         return about_north, -north * per_north, -about_north * tan_mid
 
@@ -240,8 +240,8 @@ def _advanced(x, row, library) -> list:
     a_start, _ = acceleration(v)
     v_mid = tuple(v[i] + 0.5 * (dv[i] + a_start[i] * dt) for i in range(3))
     a_mid, omega_in = acceleration(v_mid)
-    # Specific force is felt in a frame that turns: by half of its turn on average over the
-    # interval, and by a third of that half in the double integral.
+    # The frame turns during the interval: on average by half of its rotation, and by a third of
+    # that half in the double integral.
     turned = cross([half * o for o in omega_in], dv)
     v_new = tuple(v[i] + dv[i] - turned[i] + a_mid[i] * dt for i in range(3))
     r = tuple(v[i] * dt + dr[i] + dt * (half * a_mid[i] - turned[i] / 3.0) for i in range(3))
@@ -252,7 +252,7 @@ def _advanced(x, row, library) -> list:
 
     q_frame = _exponential([-0.5 * (turn[i] + earth[i] * dt) for i in range(3)])
     q = product(q_frame, product(q, q_bb))
-    # One Newton step to unit length; none for a zero step, which must not touch a bit.
+    # One Newton step to unit length; none for a zero step, which must not change a bit.
     excess = 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1.0)
     scale = 1.0 - library.where(dt == 0.0, 0.0, excess)
     return [*(scale * component for component in q), *v_new, lat_new, lon_new, alt - r[2]]

@@ -1,7 +1,7 @@
-"""Sizes that tell the unit of a sensor's numbers: gravity, the Earth's rate and field, ranges.
+"""Magnitudes that reveal the unit of sensor data: gravity, the Earth's rate and field, ranges.
 
-The doctor of logs and live filters judge by the same limits. A unit has a name only where the
-numbers are those of that unit; rates have no size at rest of which that could be known.
+The doctor of logs and live filters use the same limits. A unit is named only if the numbers match
+it; a rate at rest has no known magnitude that could reveal its unit.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import numpy as np
 
 G = 9.80665  # m/s^2
 EARTH_RATE = 7.292115e-5  # rad/s
-EARTH_FIELD_T = (20e-6, 70e-6)  # everywhere on the ground
+EARTH_FIELD_T = (20e-6, 70e-6)  # range on the ground
 
-BIASED = 0.05  # share of gravity that a cheap accelerometer may be off
+BIASED = 0.05  # largest error of a low-cost accelerometer, as a share of gravity
 REST_RATE = 0.2  # rad/s (11 deg/s): more than the bias of almost any gyro
 FASTEST = 75.0  # rad/s (4300 deg/s): beyond the range of gyros for vehicles
 STRONGEST_T = 0.1  # beyond the range of magnetometers that find north
 
-# Absurd numbers: no vehicle has them in any unit.
+# Absurd numbers: beyond any vehicle in any unit.
 GYRO_LIMIT = 1e4  # rad/s, 95 000 turns a minute, or rad for increments
 ACCEL_LIMIT = 1e6  # m/s^2, or m/s for increments
 
@@ -39,7 +39,7 @@ FIELD_UNITS = {
 
 
 def is_near(measured: float, expected: float) -> bool:
-    """Equality of specific forces but for the error of a cheap accelerometer."""
+    """True if specific forces are equal within the error of a low-cost accelerometer."""
     return abs(measured / expected - 1.0) < BIASED
 
 
@@ -49,16 +49,16 @@ def force_unit(measured: float) -> tuple[str, str] | None:
 
 
 def field_unit(measured: float) -> tuple[str, str] | None:
-    """Unit in which the size of a magnetic field is the Earth's, and how to convert it."""
+    """Unit in which the magnitude of a magnetic field is the Earth's, and how to convert it."""
     low, high = EARTH_FIELD_T
     fitting = (unit for k, unit in FIELD_UNITS.items() if low <= measured / 10.0**k <= high)
     return next(fitting, None)
 
 
 def rate_across(rate: np.ndarray, force: np.ndarray) -> float:
-    """Part of a rate (3,) across a specific force (3,) that stands still.
+    """Magnitude of a rate (3,) perpendicular to a constant specific force (3,).
 
-    A turn about the vertical leaves the force where it is; any other one carries it along, so this
-    part of the rate is an error of the gyro.
+    Only a rotation about the vertical keeps the direction of the force in body axes, so this part
+    of the rate is a gyro error.
     """
     return float(np.linalg.norm(np.cross(rate, force)) / np.linalg.norm(force))

@@ -1,7 +1,7 @@
 """Causal detection of rest, sample by sample.
 
-`standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops.
-`robins.ins.alignment.is_static` judges a whole record instead. Neither distinguishes a smooth
+`standstill` uses the scatter of the samples over a window, which suits a vehicle that stops.
+`robins.ins.alignment.is_static` tests a whole record instead. Neither distinguishes a smooth
 motion at constant speed from rest.
 """
 
@@ -17,8 +17,8 @@ def moving_statistics(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation over the `width` samples up to each one.
 
-    Sums are taken within blocks of `width` samples from the first of all on (van Herk 1992), so a
-    piece of a record has the bits of the whole, from its sample ``2 * width`` on.
+    Sums are taken within blocks of `width` samples from the first of the record on (van Herk 1992),
+    so a piece of a record gives the bits of the whole, from its sample ``2 * width`` on.
 
     Args:
         values: (N, axes).
@@ -26,7 +26,7 @@ def moving_statistics(
         first: number of samples of the record before these.
 
     Returns:
-        (N, axes) each.
+        Both (N, axes).
     """
     count = np.minimum(first + np.arange(1, len(values) + 1), width)[:, None]
     # a window is a block, or the end of a block and the beginning of the next one
@@ -58,22 +58,22 @@ def standstill(
     usual_s: float | None = None,
     first: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True where the unit stood still over the window up to each increment.
+    """Detect standstill over the window up to each increment.
 
-    Still means: on every axis the spread of turn rate and specific force is below its threshold,
-    and the mean rate below four times its own.
+    At standstill, on every axis, the standard deviations of turn rate and specific force are below
+    their thresholds, and the mean rate is below four times that of the rate.
 
     Args:
         increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
-        window_s: length of the window.
-        quiet_rate: rad/s.
-        quiet_force: m/s^2.
+        window_s: duration of the window [s].
+        quiet_rate: threshold of the standard deviation of rate [rad/s].
+        quiet_force: threshold of the standard deviation of specific force [m/s^2].
         usual_s: s, sampling interval; None: the median of dt.
         first: number of increments of the record before these.
 
     Returns:
-        (N,) bool, (N, 3) mean gyro rate over the window [rad/s], and (N,) unrest: the spread, in
-        thresholds, of the axis that is the farthest from still.
+        Mask (N,) of standstill, mean gyro rate (N, 3) [rad/s] over the window, and unrest (N,): the
+        largest standard deviation of any axis, in thresholds.
     """
     dt, theta, dv = increments[:3]
     width = max(2, round(window_s / (float(np.median(dt)) if usual_s is None else usual_s)))

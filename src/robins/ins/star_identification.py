@@ -1,23 +1,23 @@
 """Identification of stars without a prior attitude (lost in space).
 
-The angle between two stars is the same in all axes, so it can be looked up. `index_pairs` makes the
-table of all pairs of a catalogue that fit into a field of view, sorted by angle. `identify` looks
-up the angles of a triangle of directions, keeps the triangles of stars that have all three and the
-same handedness, and checks the other directions: a fourth star where the triangle predicts it makes
-it a pyramid (Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which
-drops a false star after one attempt where nested loops would try it again and again.
+The angle between two stars does not depend on the attitude, so it can be looked up. `index_pairs`
+makes the table of all pairs of a catalogue that fit into a field of view, sorted by angle.
+`identify` looks up the angles of a triangle of directions, keeps the triangles of stars with these
+angles and the same handedness, and checks the other directions: a fourth star where the triangle
+predicts it makes a pyramid (Mortari, Samaan, Bruccoleri & Junkins 2004). The order of triangles is
+theirs; it drops a false star after one attempt, where nested loops would try it repeatedly.
 
-Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
-direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
-the number of triangles tried so far that is `chance`, and the stars are named only where it is
-below a limit. So four stars are enough where they are bright and few, and are not where they are
-faint and many. A direction that two stars could be, or a star that two directions could be, has no
-name. The work is NumPy's.
+The false-identification probability is bounded. With p the probability that some star lies by
+chance within the tolerance of a direction, m of n other directions agree by chance with probability
+P(Binomial(n, p) >= m); times the number of triangles tried so far that is `chance`, and the stars
+are named only if it is below a limit. So four bright and sparse stars are enough, four faint and
+dense ones are not. A direction that matches two stars, or a star that matches two directions, is
+not named. All in NumPy.
 
-A sensor that has found its attitude need not search the sky again: the last attitude, carried on by
-the gyros, predicts the direction of each star of the catalogue. `track_stars` gives a direction the
-star within a tolerance of it, unless a second star or a second direction lays claim to the same
-place; nothing is guessed. It is pure JAX and of fixed size, for use inside a loop.
+A sensor with an attitude need not search the sky again: the last attitude, propagated by the gyros,
+predicts the direction of each star of the catalogue. `track_stars` assigns to a direction the star
+within a tolerance of it, unless a second star or a second direction matches too. It is pure JAX and
+of fixed size, for use inside a loop.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _CROWDED = 3.0
 """Density of stars over its mean, as near the Milky Way."""
 
 _MOST_TRIANGLES = 400
-# of a triangle, twice its area over its longest side [rad]: else it is ill-defined
+# least height of a triangle, twice its area over its longest side [rad]; less is ill-conditioned
 _LEAST_SIDES = 0.03
 
 
@@ -56,30 +56,30 @@ class PairIndex(NamedTuple):
     unit_i: np.ndarray  # (N, 3) directions, inertial axes
     magnitude: np.ndarray  # (N,)
     identifier: np.ndarray  # (N,) int
-    first: np.ndarray  # (P,) int, place of a star in the catalogue
-    second: np.ndarray  # (P,) int, of the other
+    first: np.ndarray  # (P,) int, index of a star in the catalogue
+    second: np.ndarray  # (P,) int, index of the other
     angle_rad: np.ndarray  # (P,) between them, ascending
-    tree: Any  # to find the star nearest to a direction
+    tree: Any  # search tree for the star nearest to a direction
 
 
 class Identification(NamedTuple):
-    """Stars named, or why none are."""
+    """Identified stars, or the reason for none."""
 
-    star: np.ndarray  # (n,) int, place in the catalogue; -1: not named
-    identifier: np.ndarray  # (n,) int, number in the catalogue; -1: not named
-    q_ib: np.ndarray  # (4,) attitude they lead to, scalar first; NaN: none
-    named: int  # directions with a name
+    star: np.ndarray  # (n,) int, index in the catalogue; -1: not named
+    identifier: np.ndarray  # (n,) int, catalogue number; -1: not named
+    q_ib: np.ndarray  # (4,) attitude from them, scalar first; NaN: none
+    named: int  # number of named directions
     chance: float  # bound of the probability that they agree by chance; 1: nothing agreed
-    triangles: int  # tried before these stars, or in vain
-    refusal: str  # why there are no names; empty: there are
+    triangles: int  # number tried
+    refusal: str  # reason for no names; empty if there are
 
 
 def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
-    """Make the table of pairs; once for a catalogue, a fraction of a second for 4559 stars.
+    """Make the table of pairs; once per catalogue, a fraction of a second for 4559 stars.
 
     Args:
-        stars: those that a camera can see, from `robins.earth.stars`. Many more, or less,
-            than it sees make identification slower or impossible.
+        stars: those that a camera detects, from `robins.earth.stars`. Many more, or fewer, than it
+            detects make identification slower or impossible.
         field_rad: largest angle between two stars in its field of view [rad].
 
     Raises:
@@ -106,7 +106,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
 
 
 def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
-    """Pairs of stars with an angle from low to high: places in the catalogue of both."""
+    """Pairs of stars with an angle from low to high, as two arrays of catalogue indices."""
     first = np.searchsorted(index.angle_rad, low_rad, side="left")
     rows = slice(first, np.searchsorted(index.angle_rad, high_rad, side="right"))
     return index.first[rows], index.second[rows]
@@ -120,19 +120,19 @@ def identify(
     magnitude_tolerance: float = 1.0,
     most_chance: float = 1e-6,
 ) -> Identification:
-    """Name the stars of an image.
+    """Identify the stars of an image.
 
     Args:
         index: from `index_pairs`.
-        vectors_b: (n, 3) directions, unit vectors in body axes; NaN: missing. False ones may be
-            among them.
+        vectors_b: (n, 3) directions, unit vectors in body axes; NaN: missing. They may include
+            false ones.
         sigma_rad: of each of the two angles of a direction [rad], a number or (n,).
-        magnitude: (n,) as seen; None: not used.
-        magnitude_tolerance: a star may be brighter or fainter than in the catalogue by so much.
+        magnitude: (n,) as measured; None: not used.
+        magnitude_tolerance: largest difference from the magnitude in the catalogue.
         most_chance: limit of the probability that the stars agree by chance.
 
     Returns:
-        The names, or the reason for none. Too few stars, or none that agree, is no error.
+        The names, or the reason for none. Too few stars, or none that agree, are no error.
 
     Raises:
         ValueError: shapes that do not fit together, directions not of unit length (to 1e-3), a
@@ -180,7 +180,7 @@ class _Image(NamedTuple):
 
 
 def _triangles(n: int) -> Iterator[tuple[int, int, int]]:
-    """Triples of n things so that one of them is soon left out of several in a row."""
+    """Triples of n indices, ordered so that each index is soon absent from several in a row."""
     for second in range(1, n - 1):
         for third in range(1, n - second):
             for i in range(n - second - third):
@@ -202,7 +202,7 @@ def _candidates(index: PairIndex, image: _Image, corners, magnitude_tolerance) -
             both = both[0][fits], both[1][fits]
         tables.append(both)
     (start, second), (again, third) = tables
-    # Join the tables where they share their first star.
+    # join the tables on their first star
     order = np.argsort(again, kind="stable")
     again, third = again[order], third[order]
     low = np.searchsorted(again, start, side="left")
@@ -230,7 +230,7 @@ def _confirmed(index: PairIndex, image: _Image, corners, stars, magnitude_tolera
         b = image.b[used]
         information = weight.sum() * np.eye(3) - (weight[:, None] * b).T @ b
         covariance = np.linalg.inv(information)
-        # Of the place where the attitude puts a direction, across that direction.
+        # variance of the predicted direction, across it
         spread = np.trace(covariance) - np.einsum("ni,ij,nj->n", image.b, covariance, image.b)
         tolerance = _WIDE * np.sqrt(image.sigma**2 + spread)
         before, star = star, _nearest(index, image, rotation, tolerance, magnitude_tolerance)
@@ -269,7 +269,7 @@ def _alike(index: PairIndex, star, magnitude, tolerance):
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> Any:
-    """Angle between unit vectors [rad], exact for small angles too."""
+    """Angle between unit vectors [rad], accurate for small angles too."""
     return 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(a - b, axis=-1), 1.0))
 
 
@@ -311,20 +311,20 @@ def track_stars(
 
     Args:
         index: of the catalogue, its reach half the field of view at least, plus the error of q_ib.
-        vectors_b: directions seen, unit vectors in body axes; NaN: none.
-        q_ib: attitude as far as known, body to inertial.
-        boresight_b: middle of the field, unit vector in body axes.
-        tolerance_rad: a star may be off by so much: some sigmas of the noise and of q_ib [rad]. It
-            should be well below the distance of neighbouring stars.
+        vectors_b: measured directions, unit vectors in body axes; NaN: none.
+        q_ib: predicted attitude, body to inertial, scalar first.
+        boresight_b: boresight, unit vector in body axes.
+        tolerance_rad: largest angle of a match, some sigmas of the noise and of q_ib [rad]. It
+            should be well below the separation of neighbouring stars.
 
     Returns:
-        (n,) place of each star in the catalogue; -1: none, or none without doubt.
+        Index (n,) of each star in the catalogue; -1: none, or ambiguous.
     """
     unit = jnp.asarray(index.unit_i)
     members = near(index, rotate(q_ib, boresight_b))
     there = ~jnp.isnan(vectors_b[:, 0])
     seen = rotate(q_ib, jnp.where(there[:, None], vectors_b, 0.0))
-    cosine = jnp.einsum("ni,ki->nk", seen, unit[members])  # zero where nothing was seen
+    cosine = jnp.einsum("ni,ki->nk", seen, unit[members])  # zero where no direction was measured
     close = (cosine > jnp.cos(jnp.asarray(tolerance_rad, float))) & (members >= 0)[None, :]
     alone = (jnp.sum(close, 1) == 1) & ~jnp.any(close & (jnp.sum(close, 0) > 1)[None, :], 1)
     return jnp.where(alone, members[jnp.argmax(close, 1)], -1)

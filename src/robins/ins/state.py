@@ -1,8 +1,8 @@
 """The state of an aided INS: attitude, velocity, position and sensor errors.
 
-A sensor reads ``raw = (1 + scale) true + bias``, component by component in body axes. `step` and
-`propagate` undo that and mechanise; `propagate_linear` also gives the transition of small errors
-over a whole block of samples, so that a filter propagates its covariance once for the block.
+A sensor reads ``raw = (1 + scale) true + bias``, component-wise in body axes. `step` and
+`propagate` correct for that and mechanise; `propagate_linear` also gives the transition of small
+errors over a whole block of samples, so that a filter propagates its covariance once per block.
 
 The state is a pytree on a manifold: `robins.manifold.retract` and `local` work on it, and its
 tangent vector is the error state of `robins.ins.errors`.
@@ -29,7 +29,7 @@ Perturbation = Any  # a number or (3,) body axes
 
 
 class InsState(NamedTuple):
-    """One state. Scale factors are states only where given; else the pytree does not hold them."""
+    """State of an aided INS. Scale factors are states if given, else not in the pytree."""
 
     q_nb: Rotation  # body FRD to navigation NED
     v_n: Array  # (3,) m/s
@@ -41,7 +41,7 @@ class InsState(NamedTuple):
 
     @classmethod
     def start(cls, nav: Nav, scales: bool = False) -> InsState:
-        """State at `nav`, with sensors believed perfect."""
+        """State at `nav`, with zero sensor errors."""
         scale = jnp.zeros(3) if scales else None
         return cls(*nav, jnp.zeros(3), jnp.zeros(3), scale, scale)
 
@@ -52,7 +52,7 @@ class InsState(NamedTuple):
 
 
 class InsNoise(NamedTuple):
-    """Noise of the sensors and of the drift of their errors: numbers, or (3,) by body axis."""
+    """Densities of sensor noise and of drift of sensor errors: numbers, or (3,) by body axis."""
 
     gyro_arw: Perturbation  # rad/sqrt(s), angle random walk
     accel_vrw: Perturbation  # m/s/sqrt(s), velocity random walk
@@ -65,16 +65,16 @@ class InsNoise(NamedTuple):
 
 
 def step(x: InsState, inc: Increments, noise: InsNoise | None = None) -> InsState:
-    """Move over one raw increment (scalar dt). The biases decay with the time constants of `noise`.
+    """Propagate by one raw increment (scalar dt); biases decay with the time constants of `noise`.
 
-    An increment that is all zero returns x unchanged.
+    A zero increment returns x unchanged.
     """
     one = Increments(*(None if a is None else jnp.asarray(a, float)[None] for a in inc))
     return propagate(x, one, noise)
 
 
 def propagate(x: InsState, block: Increments, noise: InsNoise | None = None) -> InsState:
-    """Move over a block of K raw increments (leading axis); zero ones change nothing."""
+    """Propagate over a block of K raw increments (leading axis); zero ones change nothing."""
     true, faded = _corrected(x, block, noise)
     last, _ = lax.scan(lambda at, inc: (advance(at, rows(inc)), None), vector(x.nav), true)
     return _at(x, last, faded)
@@ -93,7 +93,7 @@ def path(x: InsState, block: Increments, noise: InsNoise | None = None) -> Float
 def propagate_linear(
     x: InsState, block: Increments, noise: InsNoise, segments: int = 4
 ) -> tuple[InsState, Float[Array, "n n"], Float[Array, "n n"]]:
-    """`propagate`, and how errors and noise go through the block.
+    """`propagate`, with transition matrix and process noise of the block.
 
     See `robins.ins.transition` for the approximations. Zero increments may pad the block.
 
@@ -101,12 +101,12 @@ def propagate_linear(
         x: at the start of the block.
         block: K raw increments, leading axis.
         noise: of the sensors.
-        segments: parts of the block in which the navigation frame is taken to turn evenly and
-            noise is sampled; a quarter of a second each is plenty. At most K are used.
+        segments: parts of the block in which the navigation frame is assumed to turn evenly and
+            noise is sampled; a quarter of a second each is enough. At most K are used.
 
     Returns:
         The state at the end; Phi, with ``error(end) = Phi error(start)``; and a lower-triangular
-        factor L of the covariance Q = L L' that the noise adds to the error.
+        factor L of the process noise covariance Q = L L'.
     """
     true, faded = _corrected(x, block, noise)
     last, starts = lax.scan(lambda at, inc: (advance(at, rows(inc)), at), vector(x.nav), true)
@@ -115,7 +115,7 @@ def propagate_linear(
 
 
 def _corrected(x: InsState, block: Increments, noise: InsNoise | None):
-    """The increments without the errors of the sensors; what is left of the biases at the end."""
+    """Increments corrected for sensor errors, and biases at the end of the block."""
     block = Increments(*(None if a is None else jnp.asarray(a, float) for a in block))
     until = jnp.cumsum(block.dt)
     rates = decay_rates(x, noise)[:6]

@@ -2,22 +2,22 @@
 
 A block of K samples is cut into a few segments. Within one, the error dynamics F is split in two:
 
-*fast*, what the samples decide: specific force turns a misalignment into velocity, the attitude
-takes sensor errors into n, velocity becomes position. It is nilpotent, so its transition is a set
-of plain sums over the samples, taken as the mechanisation takes them, and no matrix product per
+*fast*, which depends on the samples: specific force turns a misalignment into velocity, attitude
+rotates sensor errors into n, velocity is integrated to position. It is nilpotent, so its transition
+is a set of plain sums over the samples, as in the mechanisation, without a matrix product per
 sample.
 
 *slow*, the rest (`errors.frame_dynamics`): Earth and transport rate, Coriolis, gravity gradient,
-decay of biases; constants of 1e-4 1/s, taken in the middle of the segment.
+decay of biases; constants of 1e-4 1/s, evaluated in the middle of the segment.
 
-The two are put together as exp(slow/2) fast exp(slow/2) (Strang 1968), wrong by the third order in
+The two are combined as exp(slow/2) fast exp(slow/2) (Strang 1968), with an error of third order in
 (slow x segment). With segments of a quarter of a second Phi differs from the Jacobian of the
-mechanisation by less than 3e-6 of what matters (see the test), even where the body shakes at 2 Hz.
+mechanisation by less than 3e-6 (relative; see the test), even if the body shakes at 2 Hz.
 
 Noise is sampled at the two Gauss points of each segment, with the mean specific force and sensor
-axes over it. That is exact for what a segment adds to attitude, velocity and biases by itself, and
-of second order where axes and force change within it: Q is good to 5e-4 in a turn, and to 2 % where
-the body shakes.
+axes over it. That is exact for the noise of attitude, velocity and biases within a segment of
+constant axes and force, and of second order if these change: Q is accurate to 5e-4 in a turn, and
+to 2 % if the body shakes.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def linearise(
     Args:
         x: the `InsState` at the start.
         true: K increments, corrected for the sensors' errors, with ``dr``.
-        starts: the vectors (see `mechanise.vector`) each of them starts from.
+        starts: states at their starts, as in `mechanise.vector`.
         noise: an `InsNoise`.
-        segments: how many, K at most.
+        segments: number of segments, at most K.
     """
     count = len(starts)
     segments = max(1, min(segments, count))
@@ -74,7 +74,7 @@ def linearise(
     nothing = jnp.eye(9), jnp.zeros((9, m)), jnp.ones(m)
     (nav, inputs, fade), columns = jax.lax.scan(before, nothing, rows, reverse=True)
     Phi = jnp.block([[nav, inputs], [jnp.zeros((m, 9)), jnp.diag(fade)]])
-    # From the last segment to the first: in the order of computation nothing is moved in memory.
+    # from the last segment to the first: in the order of computation, without a copy
     return Phi, linalg.tria(columns[::-1].reshape(-1, 9 + m).T)
 
 
@@ -117,10 +117,10 @@ def _segment(x, true: Increments, starts, noise) -> tuple[Transition, list[Impul
 
 
 def _sums(x, true: Increments, starts, total):
-    """Sums over the samples of a segment: a loop, so that a program has its body once.
+    """Sums over the samples of a segment, in a loop, so that a program contains its body once.
 
-    Samples are taken as `mechanise` takes them. Columns of the matrices are errors of three axes:
-    biases, and scales where those are states.
+    Samples are integrated as in `mechanise`. Columns of the matrices are errors of three axes:
+    biases, and scale factors if they are states.
 
     Returns:
         push, shift: (3,), whose skews are -dv and -dp of a misalignment.
@@ -140,7 +140,7 @@ def _sums(x, true: Increments, starts, total):
         left = total - elapsed  # time in the segment after the sample
         push = _product(C, dv[:, None])[:, 0]
         shift = _product(C, dr[:, None])[:, 0] + left * push
-        # a misalignment by errors of gyros so far becomes velocity and position
+        # the misalignment from gyro errors so far is integrated to velocity and position
         lever = jnp.concatenate([_product(skew(by), sums[2]) for by in (push, shift)])
         turn = columns(_product(C, _mean_rotation(theta)), dt, theta, scaled[0])
         drive = columns(C, dt, dv, scaled[1])
@@ -162,13 +162,13 @@ def _sums(x, true: Increments, starts, total):
 def _impulses(x, noise, starts, total, means) -> list[Impulses]:
     """Columns M with M M' the covariance that noise adds over a segment of length `total`.
 
-    The response at the end to unit impulses at the Gauss points, times the size of the noise and
-    the root of the weight. `means` are over the segment: skew of the specific force in n, and what
-    errors of gyros and accelerometers do to attitude and velocity a second.
+    The response at the end to unit impulses at the Gauss points, times the noise density and the
+    root of the weight. `means` are over the segment: skew of the specific force in n, and the rates
+    of attitude and velocity errors due to errors of gyros and accelerometers.
     """
     force, turn, drive = means
     rates, sigma = decay_rates(x, noise), _drives(x, noise)
-    # The root of zero has no slope, and a block may be all padding.
+    # the root of zero has no derivative, and a block may be all padding
     safe = jnp.where(total > 0.0, 0.5 * total, 1.0)
     weight = jnp.where(total > 0.0, jnp.sqrt(safe), 0.0)
     found = []
@@ -177,7 +177,7 @@ def _impulses(x, noise, starts, total, means) -> list[Impulses]:
         C_c = unpacked(starts[int(c * len(starts))]).q_nb.as_dcm()
         phi = C_c * (_spread(noise.gyro_arw) / (1.0 + scale_of(x, "gyro")))[None]
         dv = C_c * (_spread(noise.accel_vrw) / (1.0 + scale_of(x, "accel")))[None]
-        pull = to_end * force  # a misalignment becomes velocity at this share
+        pull = to_end * force  # velocity error per misalignment
         white = jnp.block(
             [[phi, jnp.zeros((3, 3))], [-pull @ phi, dv], [-0.5 * to_end * pull @ phi, to_end * dv]]
         )
@@ -211,7 +211,7 @@ def _spread(value) -> Float[Array, "3"]:
 
 
 def _mean_rotation(theta):
-    """Mean of exp(s theta x) over s from 0 to 1; the series is good to 1e-6 at half a radian."""
+    """Mean of exp(s theta x) over s from 0 to 1; the series is accurate to 1e-6 at 0.5 rad."""
     turn = skew(theta)
     sq = jnp.sum(theta * theta)
     once = 1.0 / 2.0 - sq / 24.0 * (1.0 - sq / 30.0)
@@ -220,5 +220,5 @@ def _mean_rotation(theta):
 
 
 def _product(a, b):
-    """Product of two matrices as sums, for small products one by one are slow."""
+    """Product of two matrices as sums, since single small products are slow."""
     return jnp.sum(a[:, :, None] * b[None], 1)

@@ -1,7 +1,7 @@
-"""Attitude from directions seen in body axes and known in inertial axes: stars, and two at least.
+"""Attitude from at least two directions, as of stars, measured in body and known in inertial axes.
 
 With directions b_k in body axes, r_k in inertial axes and weights w_k = 1/sigma_k^2 the most likely
-attitude has the least of Wahba's loss (Wahba 1965)::
+attitude minimises Wahba's loss (Wahba 1965)::
 
     loss = 1/2 sum_k w_k |b_k - C_bi r_k|^2  =  sum_k w_k - q' K q
 
@@ -9,16 +9,16 @@ where q is q_ib, body to inertial, and, with B = sum w b r', S = B + B', s = tr 
 
     K = [s  z'; z  S - s I]
 
-Three ways to the same answer: `davenport` takes the eigenvector of K (the q-method; Keat 1977),
+Three methods give the same result: `davenport` takes the eigenvector of K (q-method; Keat 1977),
 `svd` the singular vectors of B (Markley 1988), `quest` the largest root of the characteristic
-polynomial of K and then q in closed form (Shuster & Oh 1981). `triad` takes two directions only and
-the first of them at its word (Black 1964). The error is dtheta of ``q_true = q exp(dtheta)``, in
+polynomial of K and then q in closed form (Shuster & Oh 1981). `triad` uses two directions only and
+takes the first as exact (Black 1964). The error is dtheta of ``q_true = q exp(dtheta)``, in
 body axes; its covariance is that of Shuster (1989), the Cramer-Rao bound, for the three and that of
 two directions for TRIAD. Twice the loss is chi-square with 2 n - 3 degrees of freedom.
 
-A weight of zero is no star, so sets of different numbers share one shape; leading axes are a batch.
-Fewer than two stars, or stars along one line, leave a turn about that line open: the answer is then
-NaN, `solved` False.
+A weight of zero means no star, so sets of different size share one shape; leading axes are a batch.
+Fewer than two stars, or stars along one line, leave the rotation about that line undetermined: the
+result is then NaN, `solved` False.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from robins.rotation import from_dcm, multiply, normalise, rotate
 LEAST_SEPARATION_RAD = float(np.radians(0.5))
 """Least angle between two stars, or between one and the opposite of another, for an attitude."""
 
-_STEPS = 20  # of Newton's method; from good vectors two are enough, from contradictory ones more
-# Quaternions of no turn and of half a turn about each axis, and what these make of a vector.
+_STEPS = 20  # of Newton's method; two suffice for good vectors, contradictory ones need more
+# Quaternions of identity and of half a turn about each axis, and their effect on a vector.
 _HALF_TURNS = np.eye(4)
 _SIGNS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 
 
 class VectorAttitude(NamedTuple):
-    """An attitude found from directions; NaN where it could not be."""
+    """Attitude from directions; NaN if undetermined."""
 
-    q_ib: Any  # (..., 4) body to inertial, scalar first, not negative
+    q_ib: Any  # (..., 4) body to inertial, scalar first and not negative
     covariance: Any  # (..., 3, 3) rad^2 of dtheta, body axes
     loss: Any  # (...) Wahba's
     stars: Any  # (...) int, directions of a weight above zero
@@ -62,15 +62,15 @@ def quest(
 ) -> VectorAttitude:
     """QUEST: no eigenvectors, a polynomial of fourth degree (Shuster & Oh 1981, section VI).
 
-    The closed form divides by the scalar part of q. Their way out, the method of sequential
-    rotations, turns the references by half a turn about an axis; here all four forms are made and
-    that with the largest scalar part is taken.
+    The closed form divides by the scalar part of q. Their remedy, the method of sequential
+    rotations, turns the references by half a turn about an axis; here all four forms are computed
+    and the one with the largest scalar part is used.
 
     Args:
-        vectors_b: unit vectors in body axes; where the weight is zero they may be anything.
+        vectors_b: unit vectors in body axes; arbitrary where the weight is zero.
         vectors_i: the same directions in inertial axes.
         weight: 1/sigma^2 [1/rad^2], sigma of each of the two angles of a direction; zero: no star.
-        least_separation_rad: an angle between stars below which there is no answer [rad].
+        least_separation_rad: least angle between stars for a solution [rad].
     """
     seen = _seen(vectors_b, vectors_i, weight, least_separation_rad)
     B = seen.profile
@@ -80,7 +80,7 @@ def quest(
     c = _det(S) + jnp.sum(z * Sz, -1)
     d = jnp.sum(Sz * Sz, -1)
 
-    # From the right of all roots, where Newton's method only descends: no root exceeds sum w = 1.
+    # Newton's method descends monotonically from above all roots: no root exceeds sum w = 1.
     def descend(_, root):
         sq = root * root
         value = (sq - a) * (sq - b) + c * (s - root) - d
@@ -110,7 +110,7 @@ def davenport(
 ) -> VectorAttitude:
     """Davenport's q-method: the eigenvector of K for its largest eigenvalue; arguments as `quest`.
 
-    Nothing in it can be close to zero, at half a turn or anywhere.
+    It has no singularity, at half a turn or anywhere.
     """
     seen = _seen(vectors_b, vectors_i, weight, least_separation_rad)
     s, S, z = _parts(seen.profile)
@@ -126,7 +126,7 @@ def svd(
     weight: Float[Array, "*b n"],
     least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
-    """Markley's way: C_bi = U diag(1, 1, det U det V) V' of B = U diag(.) V'; arguments as `quest`.
+    """Markley's SVD: C_bi = U diag(1, 1, det U det V) V' of B = U diag(.) V'; arguments as `quest`.
 
     The determinants keep it a rotation where noise would make it a reflection.
     """
@@ -143,11 +143,11 @@ def triad(
     weight: Float[Array, "*b n"],
     least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
-    """TRIAD: an orthogonal frame on two directions, once in each axes; arguments as `quest`.
+    """TRIAD: frames from two directions in body and inertial axes; arguments as `quest`.
 
     The first direction is that of the largest weight, the earliest if there are several; the
-    second is that farthest from the line of the first. The others are not used, nor is the part
-    of the second beyond the turn about the first. The loss is that of all.
+    second is that farthest from the line of the first. The others are not used, and of the second
+    only the rotation about the first. The loss is that of all directions.
     """
     seen = _seen(vectors_b, vectors_i, weight, least_separation_rad)
     first = jnp.argmax(seen.weight, -1)
@@ -159,7 +159,7 @@ def triad(
         1.0 / jnp.where(seen.solved, _pick(seen.weight[..., None], k)[..., 0], 1.0)
         for k in (first, second)
     )
-    # Without an answer any two directions, so that nothing is divided by zero.
+    # without a solution any two directions, to avoid division by zero
     b1, r1, b2, r2 = (
         jnp.where(seen.solved[..., None], v, jnp.broadcast_to(jnp.eye(3)[k], v.shape))
         for v, k in ((b1, 0), (r1, 0), (b2, 1), (r2, 1))
@@ -167,8 +167,8 @@ def triad(
     in_body, in_inertial = _frame(b1, b2), _frame(r1, r2)
     q = from_dcm(in_inertial @ jnp.swapaxes(in_body, -1, -2))
 
-    # Turns about the axes of the frame. Those about the second and third are errors of b1; that
-    # about b1 is how far b2 is off the plane, over its distance s from the line of b1.
+    # Rotations about the axes of the frame. Those about the second and third are errors of b1; that
+    # about b1 is the error of b2 out of the plane, over its distance s from the line of b1.
     c, s = jnp.sum(b1 * b2, -1), jnp.sqrt(jnp.sum(jnp.cross(b1, b2) ** 2, -1))
     about, mixed = (var2 + c**2 * var1) / s**2, c * var1 / s
     zero = jnp.zeros_like(about)
@@ -178,7 +178,7 @@ def triad(
 
 
 METHODS = {"quest": quest, "davenport": davenport, "svd": svd, "triad": triad}
-"""Ways to an attitude, by name."""
+"""Methods by name."""
 
 _compiled = jax.jit(lambda way, *given: METHODS[way](*given), static_argnums=0)
 
@@ -197,7 +197,7 @@ def attitude_from_vectors(
         vectors_i: (n, 3) the same directions in inertial axes.
         sigma_rad: of each of the two angles of a direction [rad], a number or (n,).
         method: of `METHODS`.
-        least_separation_rad: an angle between directions below which there is no answer [rad].
+        least_separation_rad: least angle between directions for a solution [rad].
 
     Raises:
         ValueError: shapes that do not fit together, vectors not of unit length (to 1e-3), a sigma
@@ -223,7 +223,7 @@ def attitude_from_vectors(
             raise ValueError(
                 f"{name}[{off[0]}] is {v[off[0]]}: directions must be unit vectors, to 1e-3"
             )
-    rows = -(-max(len(b), 1) // 32) * 32  # so that few numbers of stars need to be compiled for
+    rows = -(-max(len(b), 1) // 32) * 32  # so that few shapes are compiled
     filled = np.zeros((2, rows, 3))
     filled[:, : len(b)] = b, r
     weight = np.zeros(rows)
@@ -240,9 +240,9 @@ def attitude_from_vectors(
 
 class _Solution(NamedTuple):
     b: Any  # (..., n, 3), zero where there is no star
-    r: Any  # (..., n, 3), as well
+    r: Any  # (..., n, 3), likewise
     weight: Any  # (..., n)
-    profile: Any  # (..., 3, 3) B over the sum of the weights; where there is no answer, some other
+    profile: Any  # (..., 3, 3) B over the sum of the weights; arbitrary without a solution
     solved: Any  # (...)
 
 
@@ -315,7 +315,7 @@ def _inverse(M: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
 
 
 def _frame(first: Float[Array, "*b 3"], second: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Axes in columns: along the first, towards the second, across both."""
+    """Orthonormal axes in columns: along the first, towards the second, perpendicular to both."""
     across = jnp.cross(first, second)
     across = across / jnp.sqrt(jnp.sum(across**2, -1, keepdims=True))
     along = first / jnp.sqrt(jnp.sum(first**2, -1, keepdims=True))

@@ -1,9 +1,9 @@
-"""Normal gravity as the strapdown step needs it: no trigonometry, one root, one division.
+"""Fast normal gravity for the strapdown step: no trigonometry, one root, one division.
 
 `robins.earth.gravity_n` evaluates the closed form of the level ellipsoid from a latitude. At every
-IMU sample that is the dearest part of the step, and a library sine keeps the compiler from running
-many runs side by side. The zonal series of the same field converges as e^(2n), so five terms give
-the closed form back to rounding.
+IMU sample that is the costliest part of the step, and a library sine prevents vectorisation over
+runs. The zonal series of the same field converges as e^(2n), so five terms equal the closed form to
+rounding.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from robins.rotation import Real
 
 Scalar = Float[Real, "..."]
 
-_TERMS = 5  # the first one left out, J12, is 1e-16
+_TERMS = 5  # the first one omitted, J12, is 1e-16
 
 
 def _zonal_harmonics() -> list[float]:
     """J2, J4, ... of the level ellipsoid (Heiskanen & Moritz 1967, eq. 2-92 and 2-90)."""
     m = OMEGA_E**2 * A_M**2 * B_M / GM
     t = np.sqrt(E2) / (1.0 - F)  # second eccentricity
-    # q0 = ((1 + 3/t^2) atan(t) - 3/t) / 2 as a series, for the closed form cancels
+    # q0 = ((1 + 3/t^2) atan(t) - 3/t) / 2 as a series, since the closed form cancels
     q0 = sum(
         (-1) ** (k + 1) * 2.0 * k * t ** (2 * k + 1) / ((2 * k + 1) * (2 * k + 3))
         for k in range(1, 12)
@@ -60,7 +60,7 @@ _ACROSS, _ALONG = _polynomials(_zonal_harmonics())
 
 
 def horner(coefficients, x):
-    """The polynomial with these coefficients, the constant first."""
+    """Value at x of the polynomial with these coefficients, the constant first."""
     total = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         total = c + x * total

@@ -2,10 +2,10 @@
 
 - `open_log`, `load_dataset`, `load_pair`: any known format, recognised by content, into the tables
   of `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
-- `load_ranges`: pseudoranges and odometry of a car, text of libRSF, into a `RangeLog`.
+- `load_ranges`: pseudoranges and odometry of a car, in the text format of libRSF, as a `RangeLog`.
 - `write_log`: text, by default with units in its header, or a recording of ROS 2.
-- `TextFormat` and `Column`: a row for a format of your own, `columns_from` reads it from TOML.
-- `Mounting`: how the IMU sits in the vehicle.
+- `TextFormat` and `Column`: a format of your own; `columns_from` reads it from TOML.
+- `Mounting`: orientation of the IMU in the vehicle, and lever arm of the antenna.
 - `examine`: the doctor; findings in sentences about units, axes, time, sigmas.
 - `clean`: refuses bad samples and counts them, so that a run never sees a NaN or a step back.
 """

@@ -1,12 +1,12 @@
-"""Archives of arrays as columns with names: NumPy, MATLAB, HDF5 and Parquet.
+"""Archives of arrays as named columns: NumPy, MATLAB, HDF5 and Parquet.
 
-An array of n numbers is the column of its name; of one of n rows and k columns column j is
-``name[:,j]``. What lies in a struct of MATLAB or a group of HDF5 is ``outer/name``. The longer side
-is taken for the rows, since MATLAB's own HDF5 (v7.3) has its arrays transposed. By these names a
-format finds its columns as by those of a header.
+An array of n numbers is the column of its name; column j of an array (n, k) is ``name[:,j]``. An
+array in a MATLAB struct or an HDF5 group is ``outer/name``. The longer side is taken as rows, since
+MATLAB's own HDF5 (v7.3) has its arrays transposed. A format finds its columns by these names as by
+those of a header.
 
-Nothing in a file is carried out: pickles, objects, function handles, links to other files and
-arrays that are computed are passed over (`robins.foreign` has the decoders).
+Nothing in a file is executed: pickles, objects, function handles, links to other files and computed
+arrays are skipped (`robins.foreign` has the decoders).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from robins.logs.findings import AnyPath, LogError
 from robins.logs.opening import read_beginning, read_whole
 from robins.logs.text import Columns, Head, TextLayout, peek
 
-_LARGEST = 1 << 30  # bytes of a file
-_TEXT = "S40"  # of time stamps, as `robins.logs.text` has them
-_WIDEST = 64  # columns of an array; images and point clouds are none
+_LARGEST = 1 << 30  # bytes, largest file
+_TEXT = "S40"  # type of time stamps, as in `robins.logs.text`
+_WIDEST = 64  # most columns of an array; images and point clouds are skipped
 _HEADER = 30  # bytes before the name of the first member of a zip archive
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def kind_of_archive(start: bytes) -> str:
-    """Kind of an archive by its first bytes, "" if it is none."""
+    """Kind of an archive by the first bytes of a file; "" if it is none."""
     member = start[_HEADER : _HEADER + int.from_bytes(start[26:28], "little")]
     kinds = {
         "npz": start.startswith(b"PK\x03\x04") and member.endswith(b".npy"),
@@ -51,7 +51,7 @@ def kind_of_archive(start: bytes) -> str:
 
 @lru_cache(maxsize=4)
 def names_in(path: str, changed_ns: int) -> frozenset[str]:
-    """Names of the arrays of an archive, which was changed at that time.
+    """Names of the arrays of an archive; the time of its last change is a key of the cache.
 
     Raises:
         LogError: as `arrays_in`.
@@ -72,15 +72,15 @@ def _damaged(path: str, size: int, why: str) -> LogError:
 
 
 def arrays_in(path: AnyPath, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Arrays of numbers of an archive by name.
+    """Numeric arrays of an archive by name.
 
     Args:
         path: the file, plain or compressed.
-        names: those wanted of an archive of NumPy; None: all.
+        names: those to read from a NumPy archive; None: all.
 
     Raises:
-        LogError: it is cut or damaged, or a package to read it is not installed. Nothing is read
-            from a damaged one.
+        LogError: the file is cut or damaged, or a package to read it is not installed. Nothing is
+            read from a damaged one.
     """
     data, _ = read_whole(path, _LARGEST)
     damaged = partial(_damaged, os.fspath(path), len(data))
@@ -123,10 +123,10 @@ def _columns(arrays: dict[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def rows_of(head: Head, layout: TextLayout) -> Columns:
-    """Columns of an archive as those of a text file, numbered from 1.
+    """Columns of an archive in the form of those of a text file, rows numbered from 1.
 
     Raises:
-        LogError: they are of several lengths, or hold dates where numbers are needed.
+        LogError: they differ in length, or hold dates instead of numbers.
     """
     numbers = layout.numbers
     if numbers is None:
@@ -139,7 +139,7 @@ def rows_of(head: Head, layout: TextLayout) -> Columns:
     if dates := [head.names[k] for k in numbers if head.arrays[k].dtype.kind == "M"]:
         raise LogError(head.file, f"{dates[0]} holds dates, not numbers", "declare it as the time")
     rows = next(iter(sizes.values()))
-    with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+    with np.errstate(invalid="ignore"):  # a signalling NaN stays NaN
         values = [head.arrays[k].astype(np.float64) for k in numbers]
     texts = [head.arrays[k].astype(_TEXT) for k in layout.texts]
     return Columns(

@@ -1,10 +1,10 @@
 """Batches: samples read together from a buffer, or stamps that have lost their digits.
 
-Rows of a batch have one stamp, or stamps that follow each other much faster than the sensor
-measures. Nothing is wrong with their values, so they are spread evenly: `spread` gives each row the
-time that a sensor at a constant rate takes it. The stamp of a batch read from a buffer is the time
-of its last row; where stamps are whole multiples of a power of ten that is as long as a batch,
-decimals were lost, and the stamp is the middle of its rows.
+Rows of a batch share one stamp, or have stamps that follow each other much faster than the sensor
+samples. Their values are sound, so `spread` gives them evenly spaced times, as of a sensor at a
+constant rate. The stamp of a batch read from a buffer is the time of its last row; if stamps are
+multiples of a power of ten as long as a batch, decimals were lost, and the stamp is the middle of
+its rows.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.logs.tables import Table
 
-_FEWEST = 20  # rows
-_SHARED = 0.05  # share of rows with the stamp of the row before
-_BURST = 0.3  # share of rows that follow the row before much faster than the mean
-_FAST = 8.0  # how much faster that is
-_BLOCK = 64  # rows over which the mean is taken, so that gaps do not count
-_LOST = 0.75  # of the time between batches, more than there should be: one was lost
-_AROUND = 15  # batches to either side over which stamps are averaged
-_ENOUGH = 8  # batches that tell the rate
+_FEWEST = 20  # rows in a table
+_SHARED = 0.05  # share of rows with the stamp of the previous row
+_BURST = 0.3  # share of rows that follow the previous one much faster than the mean
+_FAST = 8.0  # ratio for "much faster"
+_BLOCK = 64  # rows of a local mean, insensitive to gaps
+_LOST = 0.75  # excess interval, in intervals of batches, of a lost batch
+_AROUND = 15  # batches on each side over which stamps are averaged
+_ENOUGH = 8  # batches that suffice to find the rate
 _VALUES = {ImuTable: ("gyro", "accel"), MagTable: ("field_t",), AttitudeTable: ("q_nb",)}
 AnyTable = TypeVar("AnyTable", bound=Table)
 
 
 def batches_of(table: Table) -> np.ndarray | None:
-    """First row (b,) of each batch; None where rows do not come in batches.
+    """First row (b,) of each batch; None if rows do not come in batches.
 
-    Receivers and paths stamp each row, so only tables of sensors are looked at. A row that repeats
-    the values before it is no sample of its own.
+    Receivers and paths stamp each row, so only tables of sensors are examined. A row that repeats
+    the previous values is not counted as a sample.
     """
     if type(table) not in _VALUES or len(table) < _FEWEST:
         return None
@@ -54,15 +54,15 @@ def batches_of(table: Table) -> np.ndarray | None:
 
 
 def resolution_ns(time_ns: np.ndarray) -> int:
-    """Largest step of which all differences between stamps are multiples."""
+    """Largest step [ns] of which all differences between stamps are multiples."""
     return int(np.gcd.reduce(time_ns - time_ns[0]))
 
 
 def spread(table: AnyTable) -> AnyTable:
-    """The table with the rows of each batch spread evenly; itself where there are no batches.
+    """Table with the rows of each batch spread evenly in time; unchanged without batches.
 
-    Between lost batches the rate is that of rows over time, and times follow the stamps in the mean
-    of some batches: one stamp is late, or rounded, by up to a batch.
+    Between lost batches the rate is that of rows over time, and times follow the mean of stamps
+    over several batches: a single stamp is late, or rounded, by up to a batch.
     """
     first = batches_of(table)
     if first is None:
@@ -84,7 +84,7 @@ def spread(table: AnyTable) -> AnyTable:
     times = np.empty(len(table))
     bounds = [0, *(np.flatnonzero(broken) + 1).tolist(), len(first)]
     for a, b in itertools.pairwise(bounds):
-        # Of a batch that is not whole the decimals tell nothing.
+        # the stamp of an incomplete batch with lost decimals is not used
         known = slice(a, b - 1 if decimals and b - a > 1 else b)
         row = np.arange(first[a], last[b - 1] + 1)
         times[row] = _even(row, last[known], since[known].astype(float), usual)
@@ -92,7 +92,7 @@ def spread(table: AnyTable) -> AnyTable:
 
 
 def _even(row: np.ndarray, at: np.ndarray, since: np.ndarray, usual: float) -> np.ndarray:
-    """Times of rows by the stamps of some of them, at a rate that hardly changes."""
+    """Times of rows from the stamps of some of them, at a nearly constant rate."""
     x, begin = at - at.mean(), since[0]
     each = float(x @ (since - begin) / (x @ x)) if len(at) >= _ENOUGH else usual
     rest = np.concatenate([[0.0], np.cumsum(since - begin - each * (at - at[0]))])
@@ -103,13 +103,13 @@ def _even(row: np.ndarray, at: np.ndarray, since: np.ndarray, usual: float) -> n
 
 
 def spread_counts(kind: str, table: AnyTable, even: AnyTable) -> dict[str, int]:
-    """Number of rows that `spread` gave another time, as `robins.logs.clean` counts."""
+    """Number of rows whose time `spread` changed, in the form of counts of `clean`."""
     moved = int(np.count_nonzero(table.time_ns != even.time_ns))
     return {f"{kind}_spread": moved} if moved else {}
 
 
 def spread_like(table: AnyTable, one: Table, even: Table) -> AnyTable:
-    """`spread` of a table, with the times of another one that has the same stamps."""
+    """Apply `spread` to a table, or take the times of one with the same stamps."""
     if np.array_equal(table.time_ns, one.time_ns):
         return table if even is one else dataclasses.replace(table, time_ns=even.time_ns)
     return spread(table)

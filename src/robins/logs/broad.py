@@ -1,15 +1,15 @@
 """Trials of BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5 and .npz.
 
-Each archive, of the repository github.com/dlaidig/broad or made of one by NumPy, holds a nine-axis
-IMU and the attitude that cameras saw:
+Each archive, of the repository github.com/dlaidig/broad or converted by NumPy, holds a nine-axis
+IMU and the attitude from optical motion capture:
 
 - ``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) specific force in m/s^2, ``imu_mag`` (n, 3) uT;
 - ``opt_quat`` (n, 4), scalar first, sensor to east-north-up, NaN where the cameras lost it;
 - ``movement`` (n,), the phases that count; ``sampling_rate`` in Hz.
 
-There are no stamps: row k is k over the rate after the start. All of it is along the axes of the
-sensor, which has no front and no top. The tables say "FRD" because a body has to have a name; it
-stands for the sensor's own axes, of samples and of the attitude alike, so nothing is turned.
+There are no stamps: row k is at k / rate after the start. All data are in sensor axes, which have
+no front and no top. The tables are labelled "FRD", which here stands for the sensor's own axes, of
+samples and attitude alike, so nothing is rotated.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ def is_broad(head: Head) -> bool:
 
 
 def read_broad(path: AnyPath, findings: Findings = None) -> Dataset:
-    """Read a trial: inertial samples, magnetic field and true attitude, all along sensor axes.
+    """Read a trial: inertial samples, magnetic field and true attitude, all in sensor axes.
 
     Args:
         path: the archive.
-        findings: receives what is doubted; without it that is issued as `LogWarning`.
+        findings: receives doubts; without it they are issued as `LogWarning`.
 
     Raises:
-        LogError: the archive is cut or damaged, or an array is missing or is not what it should be.
-            Nothing is read from a damaged one: its index comes last.
+        LogError: the archive is cut or damaged, or an array is missing or invalid. Nothing is read
+            from a damaged one, whose index comes last.
     """
     file = str(path)
     arrays = arrays_in(path, _NAMES)
@@ -62,7 +62,7 @@ def read_broad(path: AnyPath, findings: Findings = None) -> Dataset:
     tables = {name: _rows_of(file, name, arrays[name], width) for name, width in _COLUMNS.items()}
     n = len(tables["imu_gyr"])
     movement = arrays["movement"]
-    if movement.shape in ((n, 1), (1, n)):  # of MATLAB, which has neither vectors nor, here, bool
+    if movement.shape in ((n, 1), (1, n)):  # from MATLAB, which has no vectors and here no bool
         movement = movement.reshape(n)
         movement = movement.astype(bool) if np.isin(movement, (0, 1)).all() else movement
     for name, rows in (*tables.items(), ("movement", movement)):
@@ -96,7 +96,7 @@ def _rows_of(file: str, name: str, array: np.ndarray, width: int) -> np.ndarray:
         raise _misfit(file, name, array, f"(n, {width}) of real numbers")
     if not len(array):
         raise refused(file, field=name)("has no rows", "record it again")
-    with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+    with np.errstate(invalid="ignore"):  # a signalling NaN stays NaN
         return np.ascontiguousarray(array, np.float64)
 
 

@@ -1,7 +1,7 @@
-"""The doctor on recorded attitudes: do they turn as the gyros say, and is gravity where it belongs?
+"""Checks of recorded attitudes against the gyros and gravity.
 
-A quaternion bears no sign of its convention. Scalar first or last, body to navigation or back, the
-axes of another body: each turns otherwise than the gyros, all but one.
+A quaternion does not show its convention: scalar first or last, body to navigation or the inverse,
+axes of the body. Only the right one rotates as the gyros do.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from robins.logs.quiet import ImuSignal, error, signal_of, warning, windows_of
 from robins.logs.tables import TOLERANCE
 from robins.rotation import to_dcm
 
-_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the turning left unexplained
+_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # unexplained shares of the rotation
 _UPRIGHT = 0.9  # cosine between gravity by these attitudes and the vertical
 
 _ORDERS = {
@@ -31,7 +31,7 @@ _ORDERS = {
 
 
 def check_attitude(imu: ImuTable, attitude: AttitudeTable) -> Iterator[Finding]:
-    """Findings about attitudes beside an IMU that is sound; see the module."""
+    """Findings about attitudes, given a sound IMU; see the module."""
     known = np.abs(np.linalg.norm(attitude.q_nb, axis=1) - 1.0) < TOLERANCE
     if not known.any():
         yield warning(attitude, "attitude_missing", len(attitude))(
@@ -86,7 +86,7 @@ def _turning(
 def _left_over(
     steps: TurnSteps, time_s: np.ndarray, q: np.ndarray, maps: np.ndarray | None = None
 ) -> np.ndarray:
-    """(h,) share of the turning that the gyros leave over, seen along other axes."""
+    """Share (h,) of the rotation that the gyros do not explain, for each map of axes."""
     S = np.eye(3)[None] if maps is None else maps
     before, after = (to_dcm(_at(when, time_s, q)) for when in (steps.begin_s, steps.end_s))
     turned = np.swapaxes(before, 1, 2) @ after
@@ -98,7 +98,7 @@ def _left_over(
 def _upright(
     attitude: AttitudeTable, signal: ImuSignal, time_s: np.ndarray, q: np.ndarray
 ) -> Iterator[Finding]:
-    """Judge by the specific force at rest whether these attitudes are upright."""
+    """Check by the specific force at rest that these attitudes are upright."""
     windows = windows_of(signal)
     middle = signal.time_s[windows.first] + 0.5
     known = windows.at_rest & (middle > time_s[0]) & (middle < time_s[-1])
@@ -124,7 +124,7 @@ def _upright(
 
 
 def _at(when: np.ndarray, time_s: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternions between the recorded ones, along the straight line: they are close together."""
+    """Quaternions interpolated linearly between recorded ones, which are close together."""
     after = np.clip(np.searchsorted(time_s, when), 1, len(time_s) - 1)
     one, other = q[after - 1], q[after]
     other = other * np.where(np.sum(one * other, axis=1) < 0.0, -1.0, 1.0)[:, None]

@@ -1,6 +1,6 @@
-"""The doctor on GNSS fixes: place, height, sigmas, quality, decimals.
+"""Checks of GNSS fixes: place, height, sigmas, quality, decimals.
 
-And on their velocities, against differences of the positions: axes, unit, sign, delay.
+Also of their velocities against differences of positions: axes, unit, sign, delay.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def check_gnss(gnss: GnssTable) -> Iterator[Finding]:
 
 def _missing(gnss: GnssTable) -> Iterator[Finding]:
     columns = {
-        "latitude": (gnss.lat_rad, np.finfo(float).max),  # wrong places have a check of their own
+        "latitude": (gnss.lat_rad, np.finfo(float).max),  # positions have a check of their own
         "longitude": (gnss.lon_rad, np.finfo(float).max),
         "height": (gnss.alt_m, ALT_LIMIT_M),
     }
@@ -46,7 +46,7 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
         bad = ~(np.abs(column) <= limit)
         if bad.any():
             k = int(np.argmax(bad))
-            # Phones know speed and bearing, but no vertical velocity, and need none.
+            # Phones state speed and bearing, but no vertical velocity.
             never = name.startswith("velocity") and bool(np.isnan(column).all())
             severity = "note" if never else "error" if bad.all() else "warning"
             yield finding(severity, gnss, "gnss_missing", int(bad.sum()), k)(
@@ -62,7 +62,7 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
     if not known.any():
         return
     beyond = known & ((np.abs(lat) > LAT_LIMIT) | (np.abs(lon) > LON_LIMIT))
-    if 2 * beyond.sum() > known.sum():  # single ones are nonsense, not a unit
+    if 2 * beyond.sum() > known.sum():  # single values are errors, not another unit
         k = int(np.argmax(beyond))
         lat_deg, lon_deg = np.rad2deg(lat[k]), np.rad2deg(lon[k])
         if abs(lat_deg) <= 360.0 and abs(lon_deg) <= 90.0:
@@ -152,7 +152,7 @@ def _quality(gnss: GnssTable) -> Iterator[Finding]:
 
 
 def _resolution(gnss: GnssTable) -> Iterator[Finding]:
-    """Decimals of the written position against its sigma."""
+    """Resolution of the recorded positions relative to their sigma."""
     lat_deg = np.unique(np.rad2deg(gnss.lat_rad[np.isfinite(gnss.lat_rad)]))
     if len(lat_deg) < 10:
         return
@@ -186,7 +186,7 @@ def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
     late = velocity_delay(track)
     if late is not None:
         steps = steps_of(track, late) or steps
-    # Between fixes far apart the vehicle turns, so its velocities there tell its way but roughly.
+    # Between fixes far apart the vehicle turns, so velocities give its displacement only roughly.
     far_apart = float(np.median(np.diff(track.time_s))) > _FAR_S
     p, v = steps.of_position[:, :2], steps.of_velocity[:, :2]
     change, scale = _horizontal(p, v)
@@ -199,7 +199,7 @@ def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
         yield _wrong_axes(gnss, change)
     elif abs(scale - 1.0) > 0.1 and not (far_apart and 0.5 < scale < 2.0):
         yield _wrong_scale(gnss, 1.0 / scale)
-    # East, north, up for north, east, down reverses the third axis too; said once is enough.
+    # East, north, up for north, east, down reverses the third axis too; one finding suffices.
     if "exchanged" not in change and _vertical_reversed(steps, track):
         names = ("down", "up") if gnss.nav == "NED" else ("up", "down")
         yield error(gnss, "velocity_sign", "vertical")(
@@ -248,7 +248,7 @@ def _late(gnss: GnssTable, track: FixTrack, late: float) -> Finding:
 
 
 def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
-    """Change of v that fits p: words (empty: none needed; None: nothing fits) and scale."""
+    """Change of v that fits p, in words ("": none needed; None: nothing fits), and scale."""
     best = ("", 0.0, np.inf)
     as_is = np.inf
     for exchange in (False, True):
@@ -266,7 +266,7 @@ def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
                 best = (words, scale, left)
     if best[2] > 0.3:
         return None, 0.0
-    # Along a straight road several changes fit alike; then nothing is wrong.
+    # Along a straight road several changes fit equally well; then none is reported.
     if best[0] != "" and as_is < 3.0 * best[2] + 0.02:
         return "", float(np.sum(p * v) / np.sum(v * v))
     return best[0], best[1]
@@ -280,7 +280,7 @@ def _vertical_reversed(steps: PositionSteps, track: FixTrack) -> bool:
 
 
 def _place_exchanged(gnss: GnssTable) -> bool:
-    """True if exchanging latitude and longitude explains more than exchanging velocities."""
+    """True if exchanging latitude and longitude fits better than exchanging velocities."""
     tracks = track_of(gnss, swap=True), track_of(gnss)
     swapped, as_is = (steps_of(track) if track else None for track in tracks)
     if swapped is None or as_is is None:

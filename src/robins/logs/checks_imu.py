@@ -1,6 +1,6 @@
-"""The doctor on the IMU alone: units by gravity, rates against increments, which way is up.
+"""Checks of an IMU by itself: units from gravity, rates against increments, upward axis.
 
-And on each of its columns: missing, stuck, saturated, coarse.
+Also of each of its columns: missing, stuck, saturated, coarse.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from robins.logs.quiet import (
     windows_of,
 )
 
-_LIVELY = 5.0  # times gravity: more than vehicles feel but for moments
-_GRAVITY = (9.7, 9.9)  # m/s^2, every place where people live
+_LIVELY = 5.0  # times gravity: vehicles exceed it for moments only
+_GRAVITY = (9.7, 9.9)  # m/s^2, range of inhabited places
 
 
 def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
@@ -44,7 +44,7 @@ def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
 
     Args:
         imu: the table.
-        in_vehicle: a vehicle has a top, so gravity must lie along z; a sensor by itself has none.
+        in_vehicle: the axes are those of a vehicle, so gravity must be along z.
     """
     signal = signal_of(imu)
     if signal is None:
@@ -55,7 +55,7 @@ def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
     windows = windows_of(signal)
     of_force = list(_gravity(imu, signal, windows))
     yield from of_force
-    if not any(f.code == "gravity_missing" for f in of_force):  # what is left has no direction
+    if not any(f.code == "gravity_missing" for f in of_force):  # otherwise there is no direction
         yield from _up(imu, windows) if in_vehicle else _free(imu, windows)
     if not any(f.code in ("rates_as_increments", "increments_as_rates") for f in of_force):
         yield from _rates(imu, signal, windows)
@@ -89,7 +89,7 @@ def _gravity(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Fin
             "another filter. Log the raw accelerometers; gravity cannot be put back."
         )
     elif size.min() < G * (1.0 + BIASED) and size.max() > G * (1.0 - BIASED):
-        return  # a vehicle that turns or climbs feels more and less than gravity, in the right unit
+        return  # in turns or climbs, specific force differs from gravity in the right unit too
     elif windows.at_rest.any():
         yield error(imu, "gravity_unknown", measured, row)(
             f"{shown}, and no usual unit makes it that. A scale factor is missing (counts of the "
@@ -106,7 +106,7 @@ _READINGS = ((G, "m/s^2", "m/s"), (1.0, "g", "g s"))
 
 
 def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, str]]:
-    """Rates taken for increments: gravity shows before anything is divided by time."""
+    """Detect rates labelled as increments: the raw specific force has the size of gravity."""
     raw = signal_of(dataclasses.replace(imu, kind="rate"))
     if imu.kind == "rate" or raw is None:
         return
@@ -125,9 +125,9 @@ def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, s
 def _increments_for_rates(
     imu: ImuTable, step_s: float, measured: float
 ) -> Iterator[tuple[str, str]]:
-    """Increments taken for rates: gravity shows as what it adds up to over one step.
+    """Detect increments labelled as rates: the specific force is gravity times the step.
 
-    So does a bias that is left where gravity was taken off, but then the motion is far larger.
+    A residual bias after removal of gravity looks alike, but then the motion is far larger.
     """
     moving = np.nanpercentile(np.linalg.norm(imu.accel, axis=1), 99.0)
     if moving > _LIVELY * measured:
@@ -154,7 +154,7 @@ def _unit_causes(measured: float) -> list[tuple[str, str]]:
 
 
 def _direction(windows: Windows) -> np.ndarray:
-    """(3,) of the specific force when it is calm."""
+    """Direction (3,) of the specific force in calm windows."""
     force = windows.accel[windows.calm]
     return np.median(force / np.linalg.norm(force, axis=-1, keepdims=True), axis=0)
 
@@ -170,7 +170,7 @@ def _free(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
 
 
 def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
-    """The sign of gravity along z: specific force at rest points up."""
+    """Check the sign of gravity along z: specific force at rest points up."""
     direction = _direction(windows)
     down = direction[2] if imu.body == "FRD" else -direction[2]
     axes = "forward-right-down" if imu.body == "FRD" else "right-forward-up"
@@ -192,10 +192,10 @@ def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
 
 
 def _rates(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Finding]:
-    """Rates that no vehicle has, and the Earth's rate in another unit.
+    """Rates beyond any vehicle, and the Earth's rate in another unit.
 
-    The unit has a name only where the Earth's rate tells it: of all others that make a bias or a
-    turn smaller, none fits better than the next.
+    The unit is named only if the Earth's rate reveals it; otherwise several units are equally
+    plausible.
     """
     fastest = np.linalg.norm(signal.gyro, axis=-1)
     k = int(np.argmax(fastest))
@@ -225,10 +225,10 @@ def _rates(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Findi
 
 
 def _earth_rate_in(rest: np.ndarray, size: float) -> str:
-    """The unit in which a steady mean rate at rest is the Earth's; empty if in none.
+    """Unit in which a steady mean rate at rest is the Earth's; "" if there is none.
 
-    The rate of a second must be steady, too, as that of gyros good enough to see the Earth turn: a
-    cheap one may have a bias of that size.
+    Means over one second must be steady too, as of gyros that can measure the Earth's rate: a
+    low-cost one may have a bias of that size.
     """
     if np.linalg.norm(rest.std(axis=0)) > 0.01 * size:
         return ""
@@ -240,12 +240,12 @@ def _earth_rate_in(rest: np.ndarray, size: float) -> str:
 
 _STUCK_S = 2.0
 _STUCK_SAMPLES = 100
-_STOPPED, _PILED = 5, 3.0  # samples at a stop, and how many times those just inside of it
-_INSIDE = 4  # steps of a column; the outermost one of a sine holds no more than the next four
-_FEW_STEPS = 16  # between the extremes of a column that is too coarse to show a stop
-_SHIFTED = 0.02  # m/s^2 of a mean, that is worth stating
-_COARSE = 64  # distinct values of a column
-_REPEATED = 0.4  # share of readings equal to the one before; 0.28 where a step is the noise
+_STOPPED, _PILED = 5, 3.0  # samples at a limit, and their ratio to those just inside
+_INSIDE = 4  # steps of a column; the outermost of a sine has no more samples than the next four
+_FEW_STEPS = 16  # between the extremes; a coarser column cannot show a limit
+_SHIFTED = 0.02  # m/s^2, smallest change of a mean that is reported
+_COARSE = 64  # distinct values of a coarse column
+_REPEATED = 0.4  # share of readings equal to the previous; 0.28 if sigma of the noise is one step
 _FULL_SCALES = {
     "gyro": [np.deg2rad(v) for v in (125, 245, 250, 450, 500, 1000, 2000, 4000)],
     "accel": [9.80665 * v for v in (2, 4, 6, 8, 16, 24, 30, 32, 40)],
@@ -308,15 +308,15 @@ def _stuck(
 def _saturated(
     imu: ImuTable, name: str, column: np.ndarray, readings: np.ndarray, step_s: float
 ) -> Iterator[Finding]:
-    """Extremes of a column with many more readings than just inside of them, in a row or not.
+    """Extremes of a column with many more readings than just inside of them, consecutive or not.
 
-    A signal that merely turns round at its extreme has no more readings there than in the next few
-    steps of the column, a sine at a constant size four fifths of them, noise far fewer.
+    An unsaturated signal has no more readings at its extreme than in the next few steps of the
+    column: a sine of constant amplitude four fifths of them, noise far fewer.
     """
     sensor, unit = ("gyro", "rad/s") if name.startswith("gyro") else ("accel", "m/s^2")
     values = column[readings]
     distinct = np.unique(values)
-    least = 1e-9 * np.abs(distinct).max()  # by which turned axes make equal numbers differ
+    least = 1e-9 * np.abs(distinct).max()  # tolerance, since rotated axes make equal numbers differ
     steps = np.diff(distinct)
     step = float(np.median(steps[steps > least])) if np.any(steps > least) else np.inf
     if np.ptp(distinct) < _FEW_STEPS * step:
@@ -328,7 +328,7 @@ def _saturated(
         scale = min(_FULL_SCALES[sensor], key=lambda scale: abs(abs(extreme) - scale))
         usual = abs(abs(extreme) / scale - 1.0) < 0.03
         share = count / len(values)
-        # A value held by most of the readings is the bulk, as of a sensor that reports no noise.
+        # A value of most readings is no limit, as of a sensor without noise.
         if count < _STOPPED or count <= _PILED * (near - count) or not (usual or share < 0.5):
             continue
         stopped = np.abs(column - extreme) <= least
@@ -349,10 +349,10 @@ def _saturated(
 
 
 def _shift(column: np.ndarray, stopped: np.ndarray, extreme: float, step_s: float) -> float:
-    """Change of the mean by what is cut off, in the seconds in which it is.
+    """Change of the mean due to clipping, over the seconds with clipping.
 
-    A vibration reaches as far on both sides of its median: as far as the other side goes beyond the
-    stop, so much is cut off here.
+    A vibration is assumed symmetric about its median: the clipped part is that by which the other
+    side exceeds the limit.
     """
     n = max(round(1.0 / step_s), 10)
     count = len(column) // n
@@ -372,7 +372,7 @@ def _coarse(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> I
     if len(values) < 1000:
         return
     distinct = np.unique(values)
-    # Noise of a step or more makes the mean of coarse numbers as good as that of fine ones.
+    # Noise of a step or more acts as dither: means of coarse numbers are then as good as others.
     if len(distinct) <= _COARSE and np.mean(np.diff(values) == 0.0) > _REPEATED:
         step = float(np.median(np.diff(distinct)))
         yield warning(imu, "coarse", step)(

@@ -1,12 +1,12 @@
-"""The doctor on a magnetometer: unit, missing, zero, stuck, stopped and repeated values, iron.
+"""Checks of a magnetometer: unit, missing, zero, stuck, saturated and repeated values, iron.
 
-The Earth's field is 20 to 70 uT strong everywhere on the ground, so its size tells the unit, and a
-size that changes with the direction tells of iron or magnets that turn with the sensor.
+The Earth's field is 20 to 70 uT everywhere on the ground, so its magnitude reveals the unit, and a
+magnitude that varies with direction reveals iron or magnets fixed to the sensor.
 
-It stands still, so from one moment to the next it must turn in the sensor as the gyros say,
-m(t + dt) = C' m(t). Magnetometers are chips of their own, and often sit otherwise than the gyros
-beside them. Each way to exchange and reverse the columns is tried, with an offset (hard iron) of
-its own; a field and its opposite turn alike, so of each pair only the right-handed one is.
+The field is constant, so in sensor axes it must rotate as the gyros measure, m(t + dt) = C' m(t).
+Magnetometers are often separate chips with other axes than the gyros. Each permutation of the
+columns with signs is tried, with an offset (hard iron) of its own; a field and its opposite rotate
+alike, so of each pair only the right-handed one is tried.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from robins.logs.motion import at, signed_permutations, steps_of
 from robins.logs.ordering import increasing
 from robins.logs.quiet import error, finding, longest_run, note, signal_of, usual_step_s, warning
 
-_FEW = 10  # samples below which nothing is judged
+_FEW = 10  # fewest samples for any check
 _STUCK_S, _STUCK_SAMPLES = 2.0, 100
-_STOP_T = 80e-6  # no magnetometer has a range as small as the Earth's field
-_STOPPED = 3  # different readings in a row at the same extreme
-_REPEATED = 0.2  # share of rows that repeat the one before
-_SPREAD = 0.25  # of the size, between its 5th and 95th percentile
-_FAR = 0.3  # of the usual size: how far off a disturbed sample is
-_TURNED = 0.02  # smallest spread of directions by which a centre is found
-_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change the gyros leave unexplained
+_STOP_T = 80e-6  # limits below this, near the Earth's field, are no end of a range
+_STOPPED = 3  # successive different readings at the same extreme
+_REPEATED = 0.2  # share of rows that repeat the previous one
+_SPREAD = 0.25  # of the magnitude, between its 5th and 95th percentiles
+_FAR = 0.3  # deviation of a disturbed sample, in usual magnitudes
+_TURNED = 0.02  # smallest spread of directions that determines a centre
+_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change not explained by the gyros
 
-# By what power of ten the numbers are too large, and what makes them so.
+# Power of ten by which the numbers are too large -> severity, cause, remedy.
 _SHIFTS: dict[int, tuple[Severity, str, str]] = {
     **{
         shift: ("error", f"The numbers are probably in {unit}", f"{fix} for tesla")
@@ -50,7 +50,7 @@ _SHIFTS: dict[int, tuple[Severity, str, str]] = {
 
 
 def check_mag(mag: MagTable) -> Iterator[Finding]:
-    """All findings about a table of magnetic field by itself, its stamps left out."""
+    """All findings about a table of magnetic field by itself, except its stamps."""
     good = np.asarray(np.isfinite(mag.field_t).all(axis=1))
     if not good.all():
         yield _missing(mag, good)
@@ -115,7 +115,7 @@ def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
         if EARTH_FIELD_T[0] <= size / 10.0**shift <= EARTH_FIELD_T[1]:
             yield finding(severity, mag, "field_unit", size)(f"{shown}. {cause}: {remedy}.")
             return
-    # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
+    # The field of iron in a low-cost casing is often stronger than the Earth's.
     if not EARTH_FIELD_T[0] / 2 <= size <= 10 * EARTH_FIELD_T[1]:
         yield error(mag, "field_unit", size)(
             f"{shown}, and no usual unit makes it that. These are counts of a converter, or other "
@@ -146,7 +146,7 @@ def _repeated(mag: MagTable, fresh: np.ndarray) -> Iterator[Finding]:
 
 
 def _stopped(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Finding]:
-    """An extreme beyond the Earth's field, met by several different readings in a row."""
+    """Saturation: successive different readings at an extreme beyond the Earth's field."""
     readings = np.flatnonzero(fresh)
     field = mag.field_t[rows[readings]]
     for axis, column in zip("xyz", field.T, strict=True):
@@ -165,7 +165,7 @@ def _stopped(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Fin
 def _iron(
     mag: MagTable, rows: np.ndarray, field: np.ndarray, size: np.ndarray
 ) -> Iterator[Finding]:
-    """A size that changes: hard iron if another centre steadies it, else soft iron or places."""
+    """Varying magnitude: hard iron if another centre steadies it, else soft iron or places."""
     usual = float(np.median(size))
     low, high = np.percentile(size, [5, 95])
     off = np.abs(size / usual - 1.0) > _FAR
@@ -198,7 +198,7 @@ def _iron(
 
 
 def _centre(field: np.ndarray) -> np.ndarray | None:
-    """Centre of the sphere through (n, 3) points, by least squares; None if they hardly turn."""
+    """Least-squares centre of a sphere through points (n, 3); None if directions hardly vary."""
     direction = field / np.linalg.norm(field, axis=1, keepdims=True)
     if np.linalg.eigvalsh(np.cov(direction.T))[0] < _TURNED:
         return None
@@ -208,7 +208,7 @@ def _centre(field: np.ndarray) -> np.ndarray | None:
 
 
 def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
-    """Findings about a field that does not turn as the gyros say; none if they hardly turn."""
+    """Findings about a field that does not rotate as the gyros do; none with little rotation."""
     signal = signal_of(imu)
     if signal is None or mag.body != imu.body:
         return
@@ -232,7 +232,7 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
 
 
 def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and field of unit size, each reading once and in order."""
+    """Times [s] and directions of the field, each reading once and in order."""
     good = np.isfinite(mag.field_t).all(axis=1) & (np.linalg.norm(mag.field_t, axis=1) > 0.0)
     good &= ~few_beyond(mag.field_t, FIELD_LIMIT_T)
     rows = np.flatnonzero(good)
@@ -247,7 +247,7 @@ def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
 def _left_over(
     before: np.ndarray, after: np.ndarray, turn: np.ndarray, maps: np.ndarray
 ) -> np.ndarray:
-    """(h,) share of the change of the field that each map and its best offset leave over."""
+    """Share (h,) of the change of the field not explained by each map with its best offset."""
     rest = np.einsum("hij,nj->hni", maps, after)
     rest = rest - np.einsum("nij,hjk,nk->hni", turn, maps, before, optimize=True)
     by_offset = (np.eye(3) - turn).reshape(-1, 3)

@@ -1,7 +1,7 @@
-"""The doctor on a master INS and the IMU to be aligned to it, as views of one motion.
+"""Checks of a master INS against the IMU to be aligned to it, which share one motion.
 
-Both sit on one vehicle, so they turn together, whatever flexes between them. The IMU must be given
-along the master's axes, as nearly as its mounting is known.
+Both are on one vehicle, so they rotate together but for flexure. The IMU must be given in the
+master's axes, as far as its mounting is known.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from robins.logs.pair_motion import (
 from robins.logs.quiet import error, finding, name_of, note, usual_step_s
 from robins.logs.tables import place_of
 
-_LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
-_WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
-_WRONG, _RIGHT = 0.1, 0.03  # shares of the specific force left unexplained
-_HALVED = 0.5  # by which what is left over falls where another convention is true
-_THIRD = 1.0 / 3.0  # likewise of velocities, whose fit has more parameters
-_CLEAR = 1.6  # times the scatter: steps of five such sigmas are no chance among thousands
+_LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; less is noise of the attitudes
+_WELL, _BETTER = 0.3, 0.1  # unexplained shares of the rotation
+_WRONG, _RIGHT = 0.1, 0.03  # unexplained shares of the specific force
+_HALVED = 0.5  # ratio by which the right convention reduces the residual
+_THIRD = 1.0 / 3.0  # likewise for velocities, whose fit has more parameters
+_CLEAR = 1.6  # times the scatter: steps of five such sigmas are significant among thousands
 _LATE_S, _TOO_LATE_S = 0.01, 0.02
 _SIGMAS = 5.0
 _CONVENTIONS = {
@@ -48,12 +48,12 @@ _CONVENTIONS = {
 
 
 def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Iterator[Finding]:
-    """Findings about what is missing, velocities against positions, and the IMU against both.
+    """Findings about missing data, velocities against positions, and the IMU against both.
 
     Args:
-        imu: along the axes of the master.
-        master: its records.
-        delay_s: by how much they are said to be older than their stamps.
+        imu: in the axes of the master.
+        master: records of the master.
+        delay_s: stated age of the records at their stamps [s].
     """
     if not len(master):
         return
@@ -66,7 +66,7 @@ def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Ite
     of_turning = list(_turning(imu, master, shared, delay_s))
     yield from of_turning
     if any(f.code == "attitude_sign" for f in of_turning):
-        return  # with such attitudes no force fits
+        return  # with wrong attitudes no force fits
     yield from _force(imu, master, shared)
     others = {f.code for f in of_velocity + of_turning if f.severity == "error"}
     if shared is not None and not others - {"master_late"}:
@@ -74,7 +74,7 @@ def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Ite
 
 
 def _as_fixes(master: Trajectory) -> GnssTable:
-    """Records as fixes whose sigma is the scatter of positions, by their second differences."""
+    """Records as fixes, with the scatter of positions, from second differences, as sigma."""
     north_m, east_m = 6.4e6 * master.lat_rad, 6.4e6 * np.cos(master.lat_rad) * master.lon_rad
     bends = np.abs(np.diff(np.stack([north_m, east_m, master.alt_m], -1), 2, axis=0))
     bends = bends[np.isfinite(bends).all(axis=1)]
@@ -135,14 +135,14 @@ def _turning(
 
 
 def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
-    """Share of the master's turning that the gyros do not explain."""
+    """Share of the master's rotation that the gyros do not explain."""
     return float(np.sum((of_master - of_gyros) ** 2) / np.sum(of_master**2))
 
 
 def _other_attitudes(
     imu: ImuTable, master: Trajectory, shared: SharedMotion, as_is: TurningFit
 ) -> Finding | None:
-    """Another convention of the attitudes, if one of them explains the turning."""
+    """Finding of another convention of the attitudes, if one explains the rotation."""
     angles = shared.q.as_euler("ZYX")
     tried = {
         f"with {name} reversed": (
@@ -169,7 +169,7 @@ def _other_attitudes(
 def _other_gyros(
     imu: ImuTable, shared: SharedMotion, as_is: TurningFit, shown: str
 ) -> Finding | None:
-    """Another unit or other axes of the gyros, if one of them explains the turning."""
+    """Finding of another unit or other axes of the gyros, if one explains the rotation."""
     maps = signed_permutations()
     scales = np.array([*SCALES, *(1.0 / s for s in SCALES)])
     tried = np.concatenate([maps, scales[:, None, None] * np.eye(3)])
@@ -205,7 +205,7 @@ def _late(imu: ImuTable, master: Trajectory, fit: TurningFit, delay_s: float) ->
 
 
 def _velocity_sign(imu: ImuTable, master: Trajectory, shared: SharedMotion) -> Iterator[Finding]:
-    """Velocities whose change the accelerometers feel only with the sign of one turned."""
+    """Check the signs of velocities: their changes must match the accelerometers."""
     as_is = fit_velocity(shared.v_n, shared)
     if as_is is None:
         return
@@ -220,7 +220,7 @@ def _velocity_sign(imu: ImuTable, master: Trajectory, shared: SharedMotion) -> I
 
 
 def _force(imu: ImuTable, master: Trajectory, shared: SharedMotion | None) -> Iterator[Finding]:
-    """Accelerometers against what the master's velocities and attitudes ask for."""
+    """Check the accelerometers against the master's velocities and attitudes."""
     forces = None if shared is None else forces_of(shared)
     if forces is None:
         yield note(imu, "force_not_checked", 0)(
@@ -235,7 +235,7 @@ def _force(imu: ImuTable, master: Trajectory, shared: SharedMotion | None) -> It
     maps = signed_permutations()
     units = [(G / value, "gravity_unit", *words) for value, words in FORCE_UNITS.items()]
     step_s = usual_step_s(imu.time_ns)
-    if imu.kind == "increment":  # before cm/s^2, which look the same at 100 Hz
+    if imu.kind == "increment":  # first, as cm/s^2 looks the same at 100 Hz
         remedy = (step_s, "rates_as_increments", "rates", "name a format of rates")
     else:
         remedy = (1.0 / step_s, "increments_as_rates", "increments", "name a format of those")

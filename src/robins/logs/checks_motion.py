@@ -1,11 +1,11 @@
-"""The doctor on IMU and GNSS together: clocks, gyros, accelerometers, lever arm, forward axis.
+"""Checks of IMU and GNSS together: clocks, gyros, accelerometers, lever arm, forward axis.
 
 All are estimated, each with its sigma (`motion_models`). A unit, an order of axes or a leap second
-is named only where the estimate is that within three sigmas; else the number is stated.
+is named only if it agrees with the estimate within three sigmas; else the number is stated.
 
-And on an IMU alone that was turned about, by gravity standing still. That is weaker, for the
-sensor's own acceleration disturbs it and a reflection of both triads looks like gyros of the
-opposite sense; used where GNSS cannot judge.
+Also of an IMU by itself that was turned about, by the constancy of gravity. That is weaker, since
+the sensor's own acceleration disturbs it and a reflection of both triads looks like gyros of the
+opposite sense; used if GNSS gives no result.
 """
 
 from __future__ import annotations
@@ -65,20 +65,20 @@ _STEPS = {
     86400.0: "That is a day",
     604800.0: "That is a week",
 } | {3600.0 * k: f"That is {k} h: a time zone" for k in range(1, 13)}
-_SIGMAS, _NAMED = 5.0, 3.0  # sigmas of a finding, and of a name
-_OFFSET_S, _DRIFT_S = 0.05, 0.1  # below which a clock is good
-_OFF, _SURE = 0.1, 0.15  # relative errors that matter, and sigmas below which an axis is seen
+_SIGMAS, _NAMED = 5.0, 3.0  # sigmas for a finding, and for a named cause
+_OFFSET_S, _DRIFT_S = 0.05, 0.1  # smaller ones are acceptable
+_OFF, _SURE = 0.1, 0.15  # relative errors that are reported, and largest sigma of an observed axis
 _TURNED_DEG, _FORWARD_DEG, _LEVER_M = 5.0, 10.0, 0.5
-_STEP_S = 5.0  # beyond which no buffer delays a fix
-_LEAST_S, _LEAST_SCALE = 0.01, 0.01  # sigmas that no clock and no gyro is better than
-_WELL, _CHI = 0.05, 3.0  # share left where causes are named, or times that of the stated noise
-_GOOD = 0.5  # most that data which fit may leave
-_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise of gravity alone
-_TURNED_SIGMA = 0.03  # of a factor of the gyros by gravity alone
+_STEP_S = 5.0  # no buffer delays a fix by more
+_LEAST_S, _LEAST_SCALE = 0.01, 0.01  # least sigmas of a clock and of a gyro scale
+_WELL, _CHI = 0.05, 3.0  # unexplained share for naming causes, or in stated noise
+_GOOD = 0.5  # largest unexplained share of consistent data
+_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise for gravity alone
+_TURNED_SIGMA = 0.03  # sigma of a gyro scale from gravity alone
 
 
 def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
-    """Findings about IMU and GNSS as views of one motion; none if there is too little of it."""
+    """Findings from the common motion of IMU and GNSS; none if there is too little motion."""
     signal, track = signal_of(imu), track_of(gnss)
     if signal is None or track is None:
         return
@@ -112,13 +112,12 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
 
 
 def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
-    """Value and sigma of what was estimated, by name.
+    """Value and sigma of each estimate, by name.
 
-    "gyros" and "gyro x" are factors that the gyros are to be multiplied by, "accel x" likewise,
-    "gyros turned" the angle between the triads [deg]. "offset" [s] and "rate" [s/s] are to be added
-    to the stamps of fixes, in the middle of the log; "step" is the largest step of the offset.
-    "lever x" [m] is along the axes of the IMU, and "forward" the direction of travel from x to y
-    [deg].
+    "gyros" and "gyro x" are correction factors of the gyros, "accel x" likewise, "gyros turned" the
+    angle between the triads [deg]. "offset" [s] and "rate" [s/s] are corrections to the stamps of
+    fixes, in the middle of the log; "step" is the largest step of the offset. "lever x" [m] is in
+    the axes of the IMU, and "forward" the direction of travel from x to y [deg].
     """
     state, sigma = verdict.fit.state, verdict.fit.sigma
     levers = verdict.fit if "clock" in verdict.free else verdict.clocked
@@ -141,7 +140,7 @@ def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
         out[f"gyro {axis}"] = factors[k], factors[k] * own[k]
         factor = verdict.factor * abs(state.M_a[k, k])
         out[f"accel {axis}"] = factor, factor * of_force[k]
-        # an offset of the clock and an antenna ahead look alike at constant speed
+        # a clock offset and an antenna ahead are not separable at constant speed
         out[f"lever {axis}"] = levers.state.lever[k], levers.sigma[LEVER][k]
     out["rate"] = state.rate, sigma[RATE]
     offset, of_offset = state.offset, np.maximum(sigma[OFFSET:], _LEAST_S)
@@ -156,14 +155,14 @@ def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
 
 
 def explained(verdict: ModelChoice) -> bool:
-    """Judge whether little is left but noise, so that the causes can be believed."""
+    """True if hardly more than noise is unexplained, so that causes can be named."""
     views = verdict.views
     noise = views.noise**2 / float(np.mean(power_of(views)))
     return verdict.fit.left(views) < max(_WELL, _CHI * noise)
 
 
 def in_body(verdict: ModelChoice) -> np.ndarray:
-    """(k, 3) velocities faster than 0.5 m/s, along the axes of the IMU [m/s]."""
+    """Velocities (k, 3) [m/s] above 0.5 m/s, in the axes of the IMU."""
     views, one = verdict.views, verdict.fit
     seen = np.zeros(len(views.v), bool)
     seen[views.node] = np.isfinite(one.squares)
@@ -173,7 +172,7 @@ def in_body(verdict: ModelChoice) -> np.ndarray:
 
 
 def travel(verdict: ModelChoice) -> tuple[float, float] | None:
-    """Direction of travel from x to y [deg] and its sigma; None where there is none."""
+    """Direction of travel from x to y [deg] and its sigma; None if undetermined."""
     v_b = in_body(verdict)
     if len(v_b) <= 20:
         return None
@@ -197,7 +196,7 @@ def _nearest(M: np.ndarray) -> np.ndarray:
 def _unclear(
     imu: ImuTable, gnss: GnssTable, verdict: ModelChoice, left: float, found: dict
 ) -> Iterator[Finding]:
-    """A motion that is explained by two causes alike, or by none."""
+    """Findings if the motion is explained by two causes equally well, or by none."""
     before = verdict.nothing.left(verdict.views)
     if before < _GOOD:
         return
@@ -287,13 +286,13 @@ def _gyros(
 
 
 def _named(value: float, sigma: float, names: dict[float, tuple[str, str]]) -> tuple | None:
-    """The one name within three sigmas; None if there is none, or another."""
+    """The unique name within three sigmas; None if there is none, or more than one."""
     near = [k for k in names if abs(np.log(value / k)) < max(_NAMED * sigma / value, 0.03)]
     return names[near[0]] if len(near) == 1 else None
 
 
 def _unit(imu: ImuTable, value: float, sigma: float, step_s: float, shown: str) -> Finding:
-    """A factor of all gyros, named where a usual unit is that."""
+    """Finding about a common factor of all gyros, named if it is that of a usual unit."""
     names = _UNITS | {
         step_s: ("rates where increments are expected", f"multiply by {step_s:g} s"),
         1 / step_s: ("increments where rates are expected", f"divide by {step_s:g} s"),
@@ -351,7 +350,7 @@ def _clock(
 
 
 def small_offset(verdict: ModelChoice) -> float | None:
-    """Seconds to be added to the stamps of fixes where that is certain and small; else None."""
+    """Correction [s] to the stamps of fixes, if it is certain and small; else None."""
     offset, sigma = estimates(verdict)["offset"]
     sound = "clock" in verdict.free and not verdict.rival and explained(verdict)
     sound &= len(verdict.fit.state.offset) == 1
@@ -405,10 +404,10 @@ def _forward(imu: ImuTable, gnss: GnssTable, found: dict) -> Iterator[Finding]:
 
 
 def _meaning(S: np.ndarray, mirrored: bool) -> tuple[str, str]:
-    """Code and cause, if the gyro needs the map S, and the specific force a reflection or not.
+    """Code and cause of a gyro map S, with the specific force reflected or not.
 
-    An accelerometer triad that is a reflection M of the true one makes axes in which rates are
-    pseudovectors: they fit after the map S = -M. Both triads reflected alike need S = -1.
+    If the accelerometer triad is a reflection M of the true one, rates, which are pseudovectors,
+    fit after the map S = -M. Both triads reflected alike need S = -1.
     """
     if mirrored and np.array_equal(S, -np.eye(3)):
         return "left_handed", (
@@ -436,7 +435,7 @@ def _meaning(S: np.ndarray, mirrored: bool) -> tuple[str, str]:
 
 
 def words_of(S: np.ndarray, sensor: str) -> str:
-    """A signed permutation as columns: (gyro_y, -gyro_x, gyro_z)."""
+    """Signed permutation in words, as columns: (gyro_y, -gyro_x, gyro_z)."""
     parts = []
     for row in S:
         j = int(np.argmax(np.abs(row)))
@@ -445,7 +444,7 @@ def words_of(S: np.ndarray, sensor: str) -> str:
 
 
 def check_turning(imu: ImuTable) -> Iterator[Finding]:
-    """Findings about gyros that do not turn gravity as the accelerometers see it turn."""
+    """Findings about gyros inconsistent with the rotation of gravity in accelerometer axes."""
     signal = signal_of(imu)
     if signal is None:
         return
@@ -455,14 +454,14 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
     views = stationary_integrals(signal._replace(accel=signal.accel * (GRAVITY / size)), imu.kind)
     if views is None:
         return
-    scales = np.array([*STARTS, 0.0])  # the last: as if it had not turned at all
+    scales = np.array([*STARTS, 0.0])  # the last: no rotation
     maps = np.concatenate([signed_permutations(), scales[:, None, None] * np.eye(3)])
     squares = squares_by_map(views, maps, np.zeros(len(views.start_s)))[:, 0]
     left = squares / np.sum(power_of(views))
     if not left[0] > _TURNED_WRONG:
         return
     k = int(np.argmin(left))
-    # A vehicle that only accelerates needs no turns to be explained, and tells nothing about them.
+    # A vehicle that only accelerates is explained without rotation, and gives no evidence on it.
     if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * left[0], 0.5 * left[-1]):
         return
     shown = (

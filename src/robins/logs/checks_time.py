@@ -1,6 +1,6 @@
-"""The doctor on time stamps: unit, batches, order, duplicates, jumps, gaps, jitter.
+"""Checks of time stamps: unit, batches, order, duplicates, jumps, gaps, jitter.
 
-And on whether the files of one run overlap in time, and are on one time base.
+Also of the overlap and common time base of the files of one run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from robins.logs.quiet import error, finding, name_of, note, place, usual_step_s
 from robins.logs.tables import Table
 from robins.logs.timebase import WEEK_S
 
-# Steps a clock makes, in seconds, and what makes them.
+# Steps of a clock [s] -> their cause.
 _WRAPS = {
     2.0**32 * 1e-6: "a 32-bit counter of microseconds that ran over",
     2.0**32 * 1e-3: "a 32-bit counter of milliseconds that ran over",
@@ -32,9 +32,9 @@ _STEPS = {
     18.0: "the 18 leap seconds between UTC and GPS time",
     3600.0: "a change of time zone or of daylight saving",
 }
-_GAP = 2.5  # usual steps
+_GAP = 2.5  # usual steps; longer is a gap
 _SLOWEST_IMU_S = 0.25
-# The longest and the shortest step; a path may be as fast as the cameras of motion capture.
+# Longest and shortest step [s]; a path may be as fast as motion capture.
 _STEPS_S = {ImuTable: (_SLOWEST_IMU_S, 2e-5), GnssTable: (45.0, 5e-3), Trajectory: (45.0, 2e-4)}
 _LONGEST_BATCH_S = 1.5
 _PART = 500  # rows
@@ -49,7 +49,7 @@ _LOST = (
     "after about a second its heading and position are no longer worth much"
 )
 _LEAP = 18.0  # s between UTC and GPS time since 2017
-_BLIP = 3  # refused samples that count as a slip, not as a clock set anew
+_BLIP = 3  # most refused samples of a slip; more mean that the clock was set
 
 
 def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
@@ -57,7 +57,7 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
 
     Args:
         table: any table.
-        unit_known: the format says in which unit its stamps are, so slow ones are just that.
+        unit_known: the format states the unit of its stamps, so a low rate is no sign of another.
     """
     if len(table) < 2:
         yield error(table, "too_short", len(table))(
@@ -84,7 +84,7 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
 
 
 def _slow(table: Table, usual: float) -> Iterator[Finding]:
-    """Stamps whose unit is beyond doubt: inertial samples too far apart to navigate by."""
+    """Inertial samples too far apart for navigation, with stamps of a known unit."""
     if isinstance(table, ImuTable) and usual > _SLOWEST_IMU_S:
         yield warning(table, "time_slow", usual)(
             f"inertial samples are {usual:.4g} s apart. The log was thinned out or its logger is "
@@ -94,7 +94,7 @@ def _slow(table: Table, usual: float) -> Iterator[Finding]:
 
 
 def _unit(table: Table, usual: float) -> Iterator[Finding]:
-    """A rate no such sensor has tells the unit of time."""
+    """Rate that no such sensor has, which reveals the unit of time."""
     slowest, fastest = _STEPS_S.get(type(table), (2.0, 2e-5))
     for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if usual > slowest and fastest < usual * factor < slowest:
@@ -111,7 +111,7 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
 
 
 def _shared(table: Table, size: float, step_s: float) -> Finding:
-    """Batches of samples of a usual size with one stamp, or stamped in a burst."""
+    """Finding about batches of samples with one stamp, or stamped in a burst."""
     many_s = size * step_s
     again = np.diff(table.time_ns) == 0
     how = (
@@ -149,7 +149,7 @@ def _duplicates(table: Table) -> Iterator[Finding]:
 
 
 def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
-    """Time that goes back: slips of single samples together, clocks set back one by one."""
+    """Stamps that go back: slips of single samples in one finding, clocks set back in one each."""
     step = np.diff(table.time_ns) * 1e-9
     slips = []
     for k in np.flatnonzero(step < 0):
@@ -184,7 +184,7 @@ def _refused_around(keep: np.ndarray, k: int) -> int:
 
 
 def _named(size: float, usual: float, names: dict[float, str]) -> str:
-    """The cause of a step of this size, as the beginning of a sentence; empty if unknown."""
+    """Cause of a step of this size, as the beginning of a sentence; "" if unknown."""
     for known, cause in names.items():
         multiple = max(round(size / known), 1)
         if (known in (1.0, 18.0) and multiple != 1) or multiple > 24:
@@ -195,9 +195,9 @@ def _named(size: float, usual: float, names: dict[float, str]) -> str:
 
 
 def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
-    """Missing samples. Steps of a clock look alike, so those of usual sizes are named as such.
+    """Missing samples. Clock steps look alike, so those of known sizes are named as such.
 
-    Receivers lose fixes for any time, and other sensors hardly matter, so there a gap is a gap.
+    Receivers lose fixes for any time, and other sensors matter little, so there every gap is one.
     """
     rows = np.flatnonzero(keep).tolist()
     step = (np.diff(table.time_ns[rows]) * 1e-9).tolist()
@@ -255,9 +255,9 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
 
 
 def _stamp_scatter(stamps: np.ndarray) -> float:
-    """Range of the stamps about a constant rate [s], in the median of parts of the table.
+    """Range of the stamps about a constant rate [s], as the median over parts of the table.
 
-    Rounding leaves that of the last digit; where rows are missing here and there it is more.
+    Rounding gives one unit of the last digit; scattered missing rows give more.
     """
     n = min(_PART, len(stamps))
     parts = (stamps[: len(stamps) // n * n] - stamps[0]).reshape(-1, n) * 1e-9
@@ -267,7 +267,7 @@ def _stamp_scatter(stamps: np.ndarray) -> float:
 
 
 def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:
-    """Findings about how the times of other tables lie against the IMU's."""
+    """Findings about the overlap of other tables with the IMU in time."""
     for other in others:
         yield from _span_of(imu, other)
 
@@ -298,14 +298,14 @@ def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
 
 
 def _span(table: Table) -> tuple[float, float]:
-    """Start and end [s], without the few stamps that a damaged clock put far away."""
+    """Start and end [s], without a few stamps far off from a faulty clock."""
     ns = np.sort(table.time_ns)
     trim = len(ns) // 100
     return float(ns[trim]) * 1e-9, float(ns[len(ns) - 1 - trim]) * 1e-9
 
 
 def _offset(a: float, b: float, c: float, d: float) -> str:
-    """Which shift of the other table's time [c, d] would put it on the IMU's [a, b]."""
+    """Likely cause, in words, of a shift between the times [a, b] of the IMU and [c, d]."""
 
     def fits(shift: float | int) -> bool:
         return min(b, d + shift) - max(a, c + shift) > 0.5 * min(b - a, d - c)

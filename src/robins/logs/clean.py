@@ -1,14 +1,14 @@
-"""Cleans a log for a run: bad samples are refused, counted and removed.
+"""Cleaning of a log for a run: bad samples are refused, counted and removed.
 
-What is refused here leaves the tables exactly as if its rows had never been recorded; no value is
-repaired, interpolated or smoothed. Samples that were stamped in batches are spread evenly, see
+Refusing leaves the tables exactly as if the rows had never been recorded; no value is repaired,
+interpolated or smoothed. Samples that were stamped in batches are spread evenly, see
 `robins.logs.batches`; then time is put in order by refusing the fewest samples, see
 `robins.logs.ordering`. Gaps are declared, not filled: the system decides whether to bridge them.
-Denormal numbers and huge but possible ones pass; outliers are the business of filters.
+Denormal numbers and huge but possible ones pass; outliers are left to filters.
 
-A magnetometer may miss samples for as long as it likes, and cameras lose a sensor behind a hand:
-the rows of magnetic field and attitude remain, NaN, so that both still run beside the inertial
-samples. Only rows whose stamps are out of order are refused.
+A magnetometer may miss samples for any time, and motion capture loses occluded sensors: their rows
+are kept as NaN, so that they stay parallel to the inertial samples. Only rows whose stamps are out
+of order are refused.
 """
 
 from __future__ import annotations
@@ -50,24 +50,24 @@ _PLACE_LIMIT = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
 
 
 def clean(dataset: Dataset) -> Dataset:
-    """Refuse what cannot be used and count it by reason.
+    """Refuse unusable samples, and count them by reason.
 
     Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
     magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
     out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``,
-    ``master_...``, ``mag_...``, ``attitude_...``, ``odometry_...``. Rows that were given a time
-    of their own within a batch are kept and counted as ``imu_spread``, where there are any.
-    Counts already in the dataset are added to.
+    ``master_...``, ``mag_...``, ``attitude_...``, ``odometry_...``. Rows of batches
+    that got a time of their own are kept and counted, as ``imu_spread``. Counts already in the
+    dataset are added to.
 
-    A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
-    not a positive number, a 1 that nobody uses. A fix with no component left is refused whole.
-    Magnetic field and attitude keep their rows, NaN where something is missing.
+    A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if not
+    positive, 1 (unused). A fix without any component is refused. Magnetic field and attitude keep
+    their rows, NaN where a component is missing.
 
     ``imu_gaps`` lists the times between which IMU samples are missing. A component of fixes whose
     sigma is never positive gets the usual one of the kind of each fix, which is a finding.
 
     Raises:
-        TypeError: it is no dataset, or one of its tables is none of its kind.
+        TypeError: the argument is no dataset, or a table is of the wrong kind.
         LogError: arrays that are no tables (F04), or fewer than two IMU samples left.
     """
     require_kind(dataset, Dataset, "clean", "make one of the table: Dataset(name, imu=table)")
@@ -103,7 +103,7 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
 
 
 def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
-    """Clean a trajectory: rows with place and attitude; a velocity may be missing (NaN)."""
+    """Clean a trajectory: keep rows with place and attitude; a velocity may be missing (NaN)."""
     truth = checked(truth)
     v_n = np.where(np.isnan(truth.v_n), 0.0, truth.v_n)
     values = np.hstack([place_of(truth), v_n, truth.q_nb])
@@ -113,9 +113,9 @@ def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
 
 
 def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
-    """Clean the report of a master INS: what is missing in a row stays missing, the rest is kept.
+    """Clean the records of a master INS: missing components stay NaN, the others are kept.
 
-    An attitude is one thing, so it is missing whole.
+    An attitude without one component is missing as a whole.
     """
     master = checked(master)
     parts: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
@@ -139,7 +139,7 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
 
 
 def _with_sigmas(gnss: GnssTable, findings: list[Finding]) -> GnssTable:
-    """Fixes with the usual sigmas of components whose sigma is never positive; adds the note."""
+    """Fixes with usual sigmas for components whose sigma is never positive; adds a note."""
     blank: dict[str, np.ndarray] = {}
     for name, values in (("sigma_m", place_of(gnss)), ("sigma_v", gnss.v_n)):
         sigma = getattr(gnss, name)
@@ -173,7 +173,7 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
 
 
 def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, Rows]]:
-    """Good rows, and bad ones by their first reason, where one bad number spoils its row."""
+    """Good rows, and bad ones by their first reason, if one bad number refuses a row."""
     nan = np.isnan(values).any(axis=1)
     inf = np.isinf(values).any(axis=1) & ~nan
     with np.errstate(invalid="ignore"):
@@ -182,7 +182,7 @@ def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, 
 
 
 def _numbers(values: np.ndarray, limit: np.ndarray | float) -> tuple[np.ndarray, dict[str, Rows]]:
-    """Values, NaN where one is not finite or beyond its limit, and rows with such by reason."""
+    """Values, NaN where not finite or beyond the limit, and affected rows by reason."""
     nan, inf = np.isnan(values), np.isinf(values)
     with np.errstate(invalid="ignore"):
         absurd = (np.abs(values) > limit) & ~inf
@@ -194,7 +194,7 @@ def _numbers(values: np.ndarray, limit: np.ndarray | float) -> tuple[np.ndarray,
 def _components(
     values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Values with NaN where a component is missing, sigmas, rows touched by each reason."""
+    """Values with NaN where a component is missing, sigmas, and affected rows by reason."""
     nan = np.isnan(values) | np.isnan(sigma)
     inf = (np.isinf(values) | np.isinf(sigma)) & ~nan
     with np.errstate(invalid="ignore"):
@@ -212,9 +212,9 @@ def _components(
 def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
     """Spans between kept samples in which others are missing.
 
-    A step longer than usual: for increments 1.5 times, for each one lost takes its motion with it;
-    for rates 2.5 times, since one lost sample is bridged by its neighbours. Also where more than
-    two samples in a row were refused as backward: a clock set back hides time that has passed.
+    A step longer than usual: for increments 1.5 times, since the motion of a lost one is lost; for
+    rates 2.5 times, since one lost sample is interpolated. Also where more than two successive
+    samples were refused as backward: a clock set back hides elapsed time.
     """
     kept, refused = np.flatnonzero(keep), np.flatnonzero(~keep)
     time_ns = imu.time_ns[kept]
@@ -246,9 +246,9 @@ def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
 
 
 def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, int]]:
-    """Clean one table of attitude; an attitude is one thing, so it is missing whole.
+    """Clean one table of attitude; an attitude without one component is missing as a whole.
 
-    Counts as `clean_mag`; ``attitude_absurd`` are quaternions that are not of unit length.
+    Counts as in `clean_mag`; ``attitude_absurd`` are quaternions that are not of unit length.
 
     Raises:
         LogError: arrays that are no table.
@@ -265,7 +265,7 @@ def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, in
 
 
 def clean_odometry(odometry: OdometryTable) -> tuple[OdometryTable, dict[str, int]]:
-    """Clean one table of wheel speeds: rows with a speed and a positive sigma.
+    """Clean one table of wheel speeds: keep rows with a speed and a positive sigma.
 
     Raises:
         LogError: arrays that are no table.

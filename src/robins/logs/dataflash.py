@@ -1,13 +1,13 @@
 """Flight logs of ArduPilot (dataflash, ``.BIN``), which describe their own messages.
 
-Read are, of the lowest instance of each (of ``GPS`` and ``GPA`` the lowest that had fixes):
+Messages read, from the lowest instance of each (for ``GPS`` and ``GPA``, the lowest with fixes):
 
 - ``IMU``: rates [rad/s] and specific force [m/s^2], forward-right-down;
-- ``MAG``: magnetic field [mG], less the offsets that the autopilot believes;
+- ``MAG``: magnetic field [mG], less the offsets set in the autopilot;
 - ``GPS``, with the accuracies and the geoid of ``GPA``: fixes at their GPS week and time of week.
 
-All else counts microseconds since power-up and is put on GPS time by the fixes. There are no
-checksums: messages must follow each other without a break, but an altered number is not noticed.
+Other stamps count microseconds since power-up and are converted to GPS time by the fixes. There are
+no checksums: messages must follow each other without a break, but an altered number is undetected.
 Source: ArduPilot, libraries/AP_Logger/README.md.
 """
 
@@ -44,19 +44,19 @@ _FORMAT = struct.Struct("<BB4s16s64s")
 _WANTED = ("IMU", "MAG", "GPS", "GPA")
 _CODES = "b=i1 B=u1 h=i2 H=u2 i=i4 I=u4 f=f4 d=f8 q=i8 Q=u8 g=f2 M=u1 a=V64 n=V4 N=V16 Z=V64 "
 _CODES += "c=i2 C=u2 e=i4 E=u4 L=i4"
-_TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # of fields, as NumPy names them
-_NO_FILL = re.compile(rb"[^\x00\xff]")  # with which blocks of a chip are filled up
+_TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # types of fields, as named by NumPy
+_NO_FILL = re.compile(rb"[^\x00\xff]")  # other than padding of flash blocks
 _FACTORS = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
 _LAST_WEEK = 6000  # in 2095
 _FIX = 2  # least status of a fix
 
 
 def read_dataflash(path: AnyPath, findings: Findings = None) -> Dataset:
-    """Read inertial samples, and field and fixes where they were logged.
+    """Read inertial samples, and magnetic field and fixes if logged.
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out or assumed; without it that is issued as `LogWarning`.
+        findings: receives omissions and assumptions; without it they are issued as `LogWarning`.
 
     Raises:
         LogError: a definition is damaged, or there are no inertial samples.
@@ -86,7 +86,7 @@ def read_dataflash(path: AnyPath, findings: Findings = None) -> Dataset:
 
 
 def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
-    """The wanted messages; bytes that belong to none are counted.
+    """Wanted messages by topic; bytes outside any message are counted.
 
     Raises:
         LogError: a definition contradicts itself or an earlier one.
@@ -98,7 +98,7 @@ def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
     at, stray, end = 0, 0, len(data)
 
     def fits(place: int) -> int:
-        """Size of the message there, 0 where there is none."""
+        """Size of the message at `place`; 0 if there is none."""
         if data[place : place + 2] != _MARK or place + 3 > end:
             return 0
         size = sizes[data[place + 2]]
@@ -106,7 +106,7 @@ def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
 
     while at < end:
         size = fits(at)
-        if not size:  # the next place where two messages follow each other
+        if not size:  # resume where two messages follow each other
             begin, at = at, data.find(_MARK, at + 1)
             while at >= 0 and not ((size := fits(at)) and (at + size == end or fits(at + size))):
                 at = data.find(_MARK, at + 1)
@@ -141,10 +141,10 @@ def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
 
 
 def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtype, list[float]]:
-    """Number, size, name and layout of a message, and what its fields are multiplied by.
+    """Number, size, name and layout of a message, and scale factors of its fields.
 
     Raises:
-        LogError: it contradicts itself.
+        LogError: the definition contradicts itself.
     """
     number, size, *texts = _FORMAT.unpack_from(data, at + 3)
     name, codes, columns = (text.rstrip(b"\0").decode("ascii", "replace") for text in texts)
@@ -162,7 +162,7 @@ def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtyp
 def _instance(
     file: str, topics: dict[str, UlogTopic], name: str, findings: Findings
 ) -> UlogTopic | None:
-    """The rows of the lowest instance; of GPS the lowest that had fixes, of GPA the same one."""
+    """Rows of the lowest instance; for GPS the lowest with fixes, for GPA the same one."""
     topic, gps = topics.get(name), topics.get("GPS")
     if topic is None or "I" not in topic.fields:
         return topic
@@ -184,7 +184,7 @@ def _instance(
 def _fixes(
     file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
-    """Fixes that have a GPS time, and when each was logged."""
+    """Fixes with a GPS time, and the time at which each was logged."""
     week, ms = column(file, gps, "GWk"), column(file, gps, "GMS")
     dated = (week > 0) & (week < _LAST_WEEK) & (ms < WEEK_NS // 1_000_000)
     report_undated(findings, file, int((~dated).sum()), "messages GPS")
@@ -201,7 +201,7 @@ def _fixes(
         out[mine] = column(file, gpa, name)[row]
         return out
 
-    # the autopilot counts the geoid's height with the other sign
+    # the autopilot uses the opposite sign for the geoid height
     separation = beside("Und")
     if np.isnan(separation).any():
         report_geoid_heights(findings, file, "A newer version of ArduPilot logs the geoid.")

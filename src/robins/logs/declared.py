@@ -1,21 +1,21 @@
 """A log format of your own, declared in TOML.
 
     separator = ";"                              # "," unless stated; " " is any number of blanks
-    body = "FLU"                                 # where x, y, z point: forward, left, up
+    body = "FLU"                                 # directions of x, y, z: forward, left, up
 
     [columns]
     time = { name = "t", unit = "ms" }
     gyro_x = { name = "wx", unit = "deg/s" }     # the name in the header
-    accel_x = { place = 5, unit = "g" }          # or the place from 1, where there is no header
+    accel_x = { place = 5, unit = "g" }          # or the column number from 1, without a header
     mag_x = { name = "mx", unit = "uT", scale = 0.15 }    # counts of 0.15 uT; -1 reverses an axis
-    sigma_north = { value = 0.5, unit = "m" }    # a constant, which no column holds
-    mag_y = { name = "y", unit = "uT", where = { sensor = "MAG" } }    # in rows of this text only
+    sigma_north = { value = 0.5, unit = "m" }    # a constant, not in any column
+    mag_y = { name = "y", unit = "uT", where = { sensor = "MAG" } }    # only in rows with this text
 
-Units are those of `robins.units`, or so many of them (``"0.1 ms"``); for dates of ISO 8601 ``iso``,
+Units are those of `robins.units`, or multiples of them (``"0.1 ms"``); for ISO 8601 dates ``iso``,
 which states its offset from UTC, ``iso UTC`` or ``iso GPS``. ``offset`` is added in the unit, after
-``scale``. ``rate = "100 Hz"`` stands for a column of time, ``decimal = ","`` for decimal commas.
-Quantities are those of `robins.logs.quantities`. Columns that are not stated may hold anything.
-`skip` lines come before the header, or before the rows without one.
+``scale``. ``rate = "100 Hz"`` replaces a column of time, ``decimal = ","`` is for decimal commas.
+Quantities are those of `robins.logs.quantities`. Undeclared columns may hold anything. `skip` lines
+precede the header, or the rows if there is none.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from robins.logs.text_format import Column, TextFormat, columns_of, header_of, o
 from robins.units import KINDS, UnitError, parse
 
 NAMED = "format:"
-"""What the name of a format begins with where files with declarations are given."""
+"""Prefix of the name of a format among files of declarations."""
 
 Paths = Iterable[AnyPath]
 Types = dict[str, tuple[type, ...]]
@@ -47,7 +47,7 @@ _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
 _KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
 _COLUMN: Types = {"name": (str,), "place": (int,), "unit": (str,), "scale": (int, float)}
 _COLUMN |= {"offset": (int, float), "value": (int, float), "where": (dict,)}
-_WIDEST = 10_000  # columns
+_WIDEST = 10_000  # most columns
 _MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
@@ -56,8 +56,8 @@ def columns_from(path: AnyPath) -> TextFormat:
     """Read a format from a TOML file.
 
     Raises:
-        LogError: the file cannot be read or is no TOML; a key, quantity or unit is unknown; columns
-            are missing. File and key are named.
+        LogError: the file cannot be read or is not TOML; a key, quantity or unit is unknown;
+            columns are missing. The message names file and key.
     """
     file = os.fspath(path)
     try:
@@ -69,7 +69,7 @@ def columns_from(path: AnyPath) -> TextFormat:
 
 
 def format_of(text: str, file: str) -> TextFormat:
-    """Read a format from TOML of a file, as `columns_from`."""
+    """Read a format from TOML text of a file, as `columns_from`."""
     with decoding(lambda why: LogError(file, f"is no TOML: {why}", "repair it")):
         content = tomllib.loads(text)
     _checked(file, "", content, _KEYS)
@@ -88,7 +88,7 @@ def format_of(text: str, file: str) -> TextFormat:
         del content["rate"]
     name = stem_of(file)
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
-    # a file of several sensors has gaps where one is slower
+    # a file of several sensors has empty cells for slower ones
     return replace(row, sparse=len(row.kinds) > 1 or any(c.where[0] for c in columns))
 
 
@@ -140,16 +140,16 @@ def _checked(file: str, at: str, table: dict[str, Any], allowed: Types):
 
 
 def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
-    """Formats that are declared or named for files: path -> its row or its name.
+    """Formats that are declared or named for files: path -> format or its name.
 
     Args:
         files: of a log.
         columns: TOML files, see `columns_from`, each of which must fit one of the files; or text
-            ``format:NAME`` for the only file, or for those that no one format is recognised for.
+            ``format:NAME`` for the only file, or for those without a uniquely recognised format.
 
     Raises:
-        LogError: as `columns_from`; a declaration fits none of the files, or two fit one; a name is
-            no format, or all files are recognised without it.
+        LogError: as `columns_from`; a declaration fits no file, or two fit one; there is no format
+            of a name, or all files are recognised without it.
     """
     files, columns = list(files), list(columns)
     names = [c.removeprefix(NAMED) for c in columns if isinstance(c, str) and c.startswith(NAMED)]
@@ -180,7 +180,7 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
 
 
 def _head(path: AnyPath) -> Head | None:
-    """Beginning of a text file; one of another kind cannot be in a declared format."""
+    """Beginning of a text file; None for other files, which cannot be in a declared format."""
     try:
         return head_of(path)
     except LogError:

@@ -1,9 +1,9 @@
-"""The doctor: reads tables as an engineer would before a run, and says what is wrong in sentences.
+"""The doctor: examination of tables before a run, with findings in sentences.
 
-Errors mean that a run would be wrong; a healthy log has none. All findings stand in two tables,
-`ALONE` and `TOGETHER`: a row a check, with what it is asked about, when, and what it can say. The
-order of the rows is the order of the examination. A new finding is a row and its function; the
-table in the documents is made of these, and a test wants a way to cause each of their codes.
+Errors mean that a run would be wrong; a healthy log has none. All checks are rows of two tables,
+`ALONE` and `TOGETHER`, with their arguments, conditions and possible findings. The order of the
+rows is that of the examination. A new check is a row and its function; the table in the documents
+is made from these, and a test requires a way to cause each code.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ class FindingCode(NamedTuple):
 
 @dataclass(frozen=True)
 class Check:
-    """A function that yields findings, and when it is asked."""
+    """A function that yields findings, with the conditions under which it runs."""
 
     topic: str  # heading in the documents
     find: Callable[..., Iterable[Finding]]
-    needs: str  # what it is given, in this order; where one of these is missing it is not asked
+    needs: str  # its arguments, in order; it does not run if one is missing
     codes: tuple[FindingCode, ...]
-    silenced_by: str = ""  # codes; beside these it would blame the wrong thing
-    unless: str = ""  # it is not asked where one of these is there, for that tells more ...
-    but_after: str = ""  # ... but where it could tell nothing, by this code
-    proves: str = ""  # codes that, if found here, replace those found before
-    overrules: str = ""  # codes found before that it judges better ...
-    undecided: str = ""  # ... unless by this code it could not
+    silenced_by: str = ""  # codes after which it would find a wrong cause
+    unless: str = ""  # tables; it does not run if one, better evidence, is there ...
+    but_after: str = ""  # ... unless this code states that it was inconclusive
+    proves: str = ""  # codes that, if found here, replace earlier findings
+    overrules: str = ""  # earlier codes about which it is more reliable ...
+    undecided: str = ""  # ... unless this code states that it was inconclusive
 
     def applies(self, things: Mapping[str, Any], found: set[str]) -> bool:
         """True if the check runs on these things and after these codes."""
@@ -63,13 +63,13 @@ class Check:
         return list(self.find(*(things[need] for need in self.needs.split())))
 
     def outdated(self, found: set[str]) -> set[str]:
-        """Codes of earlier findings that need not be told beside what this check found."""
+        """Codes of earlier findings that are superseded by those of this check."""
         judged = "" if self.undecided in found else self.overrules
         return set(self.proves.split()) & found | set(judged.split())
 
 
 def _check(topic: str, find: Callable[..., Iterable[Finding]], needs: str, **when: str):
-    """A row: what it is asked about and when, and then what it can say."""
+    """Row of a check from its arguments and conditions, completed by its codes."""
     return lambda *codes: Check(topic, find, needs, _codes(*codes), **when)
 
 
@@ -77,7 +77,7 @@ def _codes(*rows: tuple[str, str, str]) -> tuple[FindingCode, ...]:
     return tuple(FindingCode(*row) for row in rows)
 
 
-# What readers leave out or doubt while they read.
+# Findings of readers: omissions and doubts.
 OF_READERS = _codes(
     ("ends_early", "warning", "the recording or the copy was interrupted"),
     ("begins_midway", "warning", "the recording began in the middle of a line"),
@@ -110,7 +110,7 @@ _OF_VELOCITY = (
 
 _NO_PLACE = "position_unit no_fix_as_zero"
 
-# Asked about each table by itself; only findings on that table silence.
+# Run on each table by itself; silenced only by findings on that table.
 ALONE = (
     _check("In time", check_time, "stamps unit_known")(
         ("too_short", "error", "fewer than two samples; nothing can be run on that"),
@@ -182,22 +182,22 @@ ALONE = (
     ),
 )
 
-# Beside these, sensors seem to show two motions.
+# With these, sensors seem to have two motions.
 _SPOILT = (
     f"{_NO_PLACE} no_overlap rates_as_increments increments_as_rates time_unit time_slow "
     "velocity_axes velocity_unit velocity_sign"
 )
-# With these, what is compared with the gyros would be blamed for them.
+# With these, a comparison with the gyros would blame the other sensor.
 _GYROS_WRONG = "gyro_unit gyro_scale gyro_axes gyro_reversed left_handed"
 
-# Asked about all tables of a log together.
+# Run on all tables of a log together.
 TOGETHER = (
     _check("In time", check_span, "imu others")(
         ("no_overlap", "error", "the files share no time; names the offset that would fit"),
         ("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
         ("little_overlap", "warning", "the files share little of their time"),
     ),
-    # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
+    # An IMU alone is checked near rest; a master gives better evidence, in any motion.
     _check(
         "In a master and the IMU to be aligned to it",
         check_master,
@@ -287,7 +287,7 @@ TOGETHER = (
     ),
 )
 
-# Why `clean` refuses, as its counts name it.
+# Reasons for refusal by `clean`, by the names of its counts.
 REFUSALS = {
     "nan": "not a number",
     "inf": "not finite",
@@ -305,21 +305,20 @@ Use = Literal["any", "attitude"]
 
 
 def examine(subject: Subject, use: Use = "any") -> list[Finding]:
-    """Judge a dataset, or tables by themselves.
+    """Examine a dataset, or tables by themselves.
 
     Args:
-        subject: as it was read, before `clean`, so that everything is seen. Of a dataset count too
-            the findings of its readers, its ``time_unit_known`` and its ``master_delay_s``.
-        use: "attitude" where the attitude of the sensor is all that is wanted, so that it may lie
-            any way. By default that is so where nothing but the sensor was recorded: neither fixes
-            nor a path of a vehicle.
+        subject: as it was read, before `clean`, so that all samples are examined. For a dataset,
+            the findings of its readers, ``time_unit_known`` and ``master_delay_s`` are used too.
+        use: "attitude" if only the attitude of the sensor matters, so that it may have any
+            orientation; by default if neither fixes nor a path of a vehicle were recorded.
 
     Returns:
         Errors first, then warnings, then notes; empty for a log without a flaw.
 
     Raises:
-        TypeError: it is no dataset or table.
-        LogError: arrays that are no tables: other lengths, types, shapes.
+        TypeError: the subject is no dataset or table.
+        LogError: arrays of wrong length, type or shape.
     """
     parts = subject if isinstance(subject, Sequence) else [subject]
     for part in parts:
@@ -327,9 +326,9 @@ def examine(subject: Subject, use: Use = "any") -> list[Finding]:
     datasets = [part for part in parts if isinstance(part, Dataset)]
     findings = [finding for dataset in datasets for finding in dataset.findings]
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
-    with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
+    with np.errstate(all="ignore"):  # invalid numbers are examined on purpose
         tables = [checked(table) for part in parts for table in _tables(part)]
-        # a vehicle has a top; a sensor by itself may lie any way
+        # a vehicle is upright; a sensor by itself may have any orientation
         moved = any(isinstance(table, GnssTable | Trajectory) for table in tables)
         in_vehicle = moved and use != "attitude"
         evens: list[Table] = []
@@ -338,7 +337,7 @@ def examine(subject: Subject, use: Use = "any") -> list[Finding]:
         for table in tables:
             even = spread(table) if imu is None else spread_like(table, imu, all_of_them["imu"])
             things = {kind_of(table): even, "table": even, "in_vehicle": in_vehicle}
-            if not _stamped_as(table, imu):  # once is enough
+            if not _stamped_as(table, imu):  # one report suffices
                 things |= {"stamps": table, "unit_known": table.source in unit_known}
             findings += _asked(ALONE, things, [])
             all_of_them[kind_of(table)] = even
@@ -355,7 +354,7 @@ def examine(subject: Subject, use: Use = "any") -> list[Finding]:
 def _asked(
     checks: Sequence[Check], things: Mapping[str, Any], findings: list[Finding]
 ) -> list[Finding]:
-    """The findings, with those of the checks that are asked about these things."""
+    """Findings, extended by those of the checks that apply."""
     for check in checks:
         if check.applies(things, {f.code for f in findings}):
             new = check.run(things)

@@ -1,6 +1,6 @@
 """Messages about a log: findings, which are counted, and errors, which stop the reading.
 
-Both name the file, the line or time, the value, the likely cause and the mend, in one sentence.
+Both give file, line or time, value, likely cause and fix in one sentence.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from robins.dataset import Finding as Finding  # where datasets hold them; read from here too
+from robins.dataset import Finding as Finding  # defined with datasets; exported from here too
 from robins.dataset import Severity as Severity
 from robins.errors import RobinsError
 
 AnyPath: TypeAlias = str | os.PathLike[str]
 Findings: TypeAlias = list[Finding] | None
-"""Takes what a reader leaves out or doubts; None: that is issued as `LogWarning`."""
+"""List for omissions and doubts of a reader; None: they are issued as `LogWarning`."""
 Value = float | int | str
 FETCH_AGAIN = "fetch it again; nothing of it was used, for no number in it can be trusted"
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 class LogError(RobinsError, ValueError):
-    """A log was refused; `where` names the file, and line or time if not all of it is meant.
+    """A log was refused; `where` names the file, and line or time unless it is the whole file.
 
     Attributes:
-        file: the file, or what stood in its place.
-        field: name of the column; empty when the whole line is meant.
+        file: the file, or its replacement in messages.
+        field: name of the column; "" for the whole line.
         value: the offending text or number.
     """
 
@@ -51,13 +51,13 @@ class LogError(RobinsError, ValueError):
 def refused(
     file: str, where: str = "", field: str = "", value: object = ""
 ) -> Callable[[str, str], LogError]:
-    """Makes a `LogError` about a place in a file of what is wrong and how to mend it."""
+    """Maker of a `LogError` about a place in a file, from the fault and its fix."""
     return lambda what, fix: LogError(file, what, fix, where=where, field=field, value=value)
 
 
 @contextmanager
 def os_errors(file: str, done: str = "read", fix: str = "check path and permissions"):
-    """Turn an error of the operating system into a `LogError`."""
+    """Context that turns an error of the operating system into a `LogError`."""
     try:
         yield
     except OSError as error:
@@ -66,7 +66,7 @@ def os_errors(file: str, done: str = "read", fix: str = "check path and permissi
 
 @contextmanager
 def extra_package(file: str, what: str, package: str = "the package that reads it"):
-    """Turn the failed import of a package of the extra `logs` into a `LogError`."""
+    """Context that turns a failed import of a package of the extra `logs` into a `LogError`."""
     try:
         yield
     except ImportError as error:
@@ -75,19 +75,19 @@ def extra_package(file: str, what: str, package: str = "the package that reads i
 
 
 class LogWarning(UserWarning):
-    """A finding of a reader that was given no list to put it in."""
+    """A finding of a reader that was called without a list of findings."""
 
 
 def make_finding(
     severity: Severity, code: str, file: str, where: str = "", value: Value = "", name: str = ""
 ) -> Callable[[str], Finding]:
-    """Makes a finding of its sentence, put behind name (or file) and place."""
+    """Maker of a finding from its sentence, which follows name (or file) and place."""
     begin = f"{name or Path(file).name} {where}".rstrip()
     return lambda sentence: Finding(severity, code, file, where, value, f"{begin}: {sentence}")
 
 
 def report(findings: Findings, finding: Finding) -> None:
-    """Append to the list; without one, issue a `LogWarning`: nothing is refused silently."""
+    """Append to the list; without one, issue a `LogWarning`, so that nothing is silent."""
     if findings is None:
         warnings.warn(str(finding), LogWarning, stacklevel=3)
     else:
@@ -97,32 +97,32 @@ def report(findings: Findings, finding: Finding) -> None:
 def finding_reporter(
     findings: Findings, severity: Severity, code: str, file: str, where: str = "", value: Value = ""
 ) -> Callable[[str], None]:
-    """Reports the finding that `make_finding` makes of its sentence."""
+    """Reporter of the finding that `make_finding` makes of a sentence."""
     make = make_finding(severity, code, file, where, value)
     return lambda sentence: report(findings, make(sentence))
 
 
 def damaged(file: str) -> Callable[[str], LogError]:
-    """Makes the error about a damaged file of the reason."""
+    """Maker of the error about a damaged file, from the reason."""
     return lambda why: LogError(file, f"is damaged ({why})", FETCH_AGAIN)
 
 
 def report_left_out(findings: Findings, file: str, count: int, what: str) -> None:
-    """Report what was not read because it is damaged, if there is any."""
+    """Report the number of items not read because they are damaged, unless zero."""
     if count:
         make = finding_reporter(findings, "warning", "damaged_frames", file, value=count)
         make(f"{count} {what}; they are left out.")
 
 
 def report_undated(findings: Findings, file: str, count: int, what: str) -> None:
-    """Report fixes from before a receiver knew the date, if there are any."""
+    """Report the number of fixes without a date, unless zero."""
     if count:
         make = finding_reporter(findings, "note", "undated", file, value=count)
         make(f"{count} {what} have no date yet; they are left out.")
 
 
 def report_cut_end(findings: Findings, file: str, at: int) -> None:
-    """Report a last message that is not whole."""
+    """Report an incomplete last message."""
     finding_reporter(findings, "warning", "ends_early", file, f"byte {at}", at)(
         "the last message is not whole: the recording or the copy was interrupted. All before it "
         "was read."

@@ -1,7 +1,7 @@
-"""Kinds of fixes as RTKLIB counts them, and sigmas where a receiver states none.
+"""Kinds of fixes, numbered as in RTKLIB, and usual sigmas for receivers that state none.
 
-1 is a fixed solution, 2 float, 3 with augmentation by satellite, 4 differential, 5 single, 6 a
-precise point position; 0 is none of them.
+1 is a fixed solution, 2 float, 3 with satellite augmentation, 4 differential, 5 single, 6 precise
+point positioning; 0 is none of them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from robins.dataset import GnssTable
 from robins.logs.findings import Finding, Findings, report
 
 PX4 = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
-"""Type of a fix in PX4 -> kind; less is no fix, 2 has no height, and 8 is extrapolated: none."""
+"""Type of a fix in PX4 -> kind; 0 and 1 are no fix, 2 has no height, 8 (extrapolated) is none."""
 MAVLINK = PX4 | {7: 1, 8: 6}
-"""GPS_FIX_TYPE of MAVLink and ArduPilot, where 7 is a static base and 8 a precise point."""
+"""GPS_FIX_TYPE of MAVLink and ArduPilot -> kind; 7 is a static base, 8 is PPP."""
 
 _USUAL = {1: (0.02, 0.05), 2: (0.3, 0.1), 3: (1.0, 0.2), 4: (1.0, 0.2), 5: (3.0, 0.3)}
 _USUAL[6] = (0.1, 0.1)
-"""Usual sigma of a horizontal place [m] and of a velocity [m/s] of each kind, in the open."""
+"""Usual sigmas of horizontal position [m] and velocity [m/s] of each kind, in the open."""
 _ASSUMED = {
     "place": "0.02 m for fixed, 0.3 m for float, 3 m for single ones",
     "velocity": "0.05 m/s for fixed, 0.1 m/s for float, 0.3 m/s for single ones",
@@ -39,18 +39,18 @@ def fixes(
     flat: np.ndarray,
     findings: Findings,
 ) -> GnssTable:
-    """Fixes of a receiver: NaN where it had none, and the usual sigmas where it stated none.
+    """Fixes of a receiver, NaN without a fix, with usual sigmas where none is stated.
 
     Args:
         file: source of the table.
         time_ns: (n,) stamps.
         place: latitude, longitude [deg], height [m], (n,) each.
-        sigma_m: along north, east, down; zero or NaN where it is not stated.
-        v_n: (n, 3) velocity.
-        sigma_v: (n,) of each component of the velocity; likewise.
-        kind: (n,) of the fix; 0 where there is none.
-        flat: (n,) bool; such a fix has neither height nor velocity.
-        findings: receives a note where sigmas are assumed.
+        sigma_m: north, east, down [m], (n,) each; zero or NaN if not stated.
+        v_n: (n, 3) velocity [m/s].
+        sigma_v: (n,) of each component of the velocity [m/s], likewise.
+        kind: (n,) of the fix; 0 without a fix.
+        flat: (n,) bool, fixes without height and velocity.
+        findings: receives a note if sigmas are assumed.
     """
     there, solid = kind > 0, (kind > 0) & ~flat
     lat, lon = (np.deg2rad(np.where(there, value, np.nan)) for value in place[:2])
@@ -65,7 +65,7 @@ def fixes(
 def over_ground(
     speed: np.ndarray, course_deg: np.ndarray, down: np.ndarray | float = np.nan
 ) -> np.ndarray:
-    """Velocity north, east, down, (n, 3), of a speed over ground and its course."""
+    """Velocity (n, 3), north, east, down, from speed over ground and course."""
     course = np.deg2rad(course_deg)
     with np.errstate(invalid="ignore"):  # an infinite course has no direction
         north, east = speed * np.cos(course), speed * np.sin(course)
@@ -75,10 +75,10 @@ def over_ground(
 def with_usual_sigmas(table: GnssTable, findings: Findings, places: bool = True) -> GnssTable:
     """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
 
-    The table marks which these are (``assumed_m``, ``assumed_v``), beside those marked before.
-    The `where` of the note is "place", "velocity" or both: the sigmas that are assumed.
+    The table marks them (``assumed_m``, ``assumed_v``), in addition to those marked before. The
+    `where` of the note names the assumed sigmas: "place", "velocity" or both.
 
-    Vertical sigmas are twice the horizontal ones. What is missing itself gets no sigma.
+    Vertical sigmas are twice the horizontal ones. Missing values get no sigma.
     """
     kinds = np.zeros(len(table), np.int64) if table.quality is None else table.quality
     usual = np.array([_USUAL.get(int(k), _USUAL[5]) for k in kinds]).reshape(-1, 2)

@@ -1,15 +1,15 @@
 """Folders that are one recording: ROS, EuRoC, KITTI, phones, gnss-ins-sim.
 
 - EuRoC and ASL: ``mav0`` or the folder above it, with ``imu0`` and ``state_groundtruth_estimate0``.
-- KITTI raw: ``oxts`` with ``data/*.txt`` and ``timestamps.txt``, of which the columns are in the
-  development kit. x, y, z are forward, left, up; yaw counts from east against the clock.
-- Sensor Logger: a file a sensor (UNITS.md and COORDINATES.md of tszheichoi/awesome-sensor-logger).
+- KITTI raw: ``oxts`` with ``data/*.txt`` and ``timestamps.txt``; the columns are described in the
+  development kit. x, y, z are forward, left, up; yaw is counterclockwise from east.
+- Sensor Logger: a file per sensor (tszheichoi/awesome-sensor-logger: UNITS.md, COORDINATES.md).
   Android's ``TotalAcceleration`` is the specific force; of an iPhone it is the sum of
   ``Accelerometer`` and ``Gravity``, reversed unless the axes were standardised.
-- phyphox: a file a sensor, its columns named with their units.
+- phyphox: a file per sensor, with columns named with their units.
 - gnss-ins-sim: ``time.csv``, ``gyro-0.csv``, ``accel-0.csv`` and the files of the reference.
 
-Axes of phones are those of Android: right, forward, up of one that lies flat.
+Axes of phones are those of Android: right, forward, up if it lies flat.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from robins.units import to_si
 _XYZ = ("x", "y", "z")
 _TRUTH = "state_groundtruth_estimate0/data.csv"
 _ROWS = {row.name: row for row in TEXT_FORMATS}
-_OXTS = 30  # numbers of a record
-_LARGEST = 1 << 26  # bytes of a file of OXTS
+_OXTS = 30  # numbers in a record
+_LARGEST = 1 << 26  # bytes, largest OXTS file
 _FLU = np.array([1.0, -1.0, -1.0])
 _SEPARATORS = (",", ";", "\t")
 
@@ -54,13 +54,12 @@ def read_folder(
 
     Args:
         path: the folder.
-        findings: receives what was left out or is doubted; without it that is issued as
-            `LogWarning`.
-        origin: where a path in local metres, that of EuRoC, is put on the Earth.
+        findings: receives omissions and doubts; without it they are issued as `LogWarning`.
+        origin: position on the Earth of a path in local metres, as of EuRoC.
 
     Raises:
-        LogError: it is of no known kind; a file of it is missing or cannot be read; there is an
-            origin, and nothing in local metres.
+        LogError: the folder is of no known kind; a file is missing or cannot be read; an origin is
+            given, but nothing is in local metres.
     """
     folder = Path(path)
     with os_errors(str(path), fix="check its permissions"):
@@ -90,10 +89,10 @@ def _table(
 ) -> Columns:
     """Columns by patterns of their names: the stamps, if any, and numbers.
 
-    Of the names so many are needed, by default all; other columns that lack are NaN.
+    The first `needed` names, by default all, are required; other missing columns are NaN.
 
     Raises:
-        LogError: a column that is needed lacks, or the file cannot be read.
+        LogError: a required column is missing, or the file cannot be read.
     """
     line, text = (peek(path).data(1) or [(1, "")])[0]
     separator = max(_SEPARATORS, key=text.count)
@@ -215,7 +214,7 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
     if (path := folder / "Location.csv").exists():
         fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
-            v[v[:, k] < 0.0, k] = np.nan  # what is not known
+            v[v[:, k] < 0.0, k] = np.nan  # unknown
         fixes = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
         gnss = with_usual_sigmas(fixes, findings)
         if gnss.v_n is None or np.isnan(gnss.v_n).all():
@@ -238,10 +237,10 @@ _LOCATION = (
 
 
 def _apple(folder: Path) -> float:
-    """Sign of what Sensor Logger calls acceleration, as a specific force.
+    """Sign that converts the acceleration of Sensor Logger to specific force.
 
     Raises:
-        LogError: the file that tells the make of the phone is missing.
+        LogError: the file that states the make of the phone is missing.
     """
     path = folder / "Metadata.csv"
     lines = peek(path).lines[:2] if path.exists() else []
@@ -292,4 +291,4 @@ _FOLDERS: dict[str, Callable[[Path, Findings], Dataset]] = {
     "Gyroscope.csv": _phone,
     "gyro-0.csv": _simulated,
 }
-"""A file in a folder of each kind, and who reads it."""
+"""Characteristic file of each kind of folder -> its reader."""

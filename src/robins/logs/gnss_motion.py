@@ -13,13 +13,13 @@ from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
 
 _BASE_S = 1.0
-_BASES_S = (_BASE_S, 2.0, 4.0, 8.0)  # the shortest is taken that moves a receiver enough
-_SPEED = 0.3  # m/s; below it a receiver at rest
-_KEPT = 0.9  # share of the steps that tell how late velocities are, those that fit best
+_BASES_S = (_BASE_S, 2.0, 4.0, 8.0)  # the shortest one with enough motion is used
+_SPEED = 0.3  # m/s; a slower receiver is at rest
+_KEPT = 0.9  # share of the steps, those that fit best, used for the delay of velocities
 
 
 class FixTrack(NamedTuple):
-    """The complete fixes of a table, in the order of time."""
+    """Complete fixes of a table, in order of time."""
 
     rows: np.ndarray  # (m,) index into the table
     time_s: np.ndarray  # (m,) since the table's first row
@@ -34,7 +34,7 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> FixTrack | None:
 
     Args:
         gnss: the table.
-        swap: exchange latitude and longitude, to see whether they were exchanged.
+        swap: exchange latitude and longitude, to test for that error.
     """
     lat, lon = (gnss.lon_rad, gnss.lat_rad) if swap else (gnss.lat_rad, gnss.lon_rad)
     place = np.stack([lat, lon, gnss.alt_m], axis=-1)
@@ -62,7 +62,7 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> FixTrack | None:
 
 
 class PositionSteps(NamedTuple):
-    """Change of position over one to eight seconds, seen by positions and by velocities [m]."""
+    """Change of position [m] over one to eight seconds, from positions and from velocities."""
 
     of_position: np.ndarray  # (k, 3)
     of_velocity: np.ndarray  # (k, 3)
@@ -73,18 +73,18 @@ def steps_of(track: FixTrack, late_s: float = 0.0) -> PositionSteps | None:
 
     Args:
         track: the fixes.
-        late_s: velocities are taken to be this much older than their stamps say.
+        late_s: age of velocities at their stamps [s].
     """
     if track.v_n is None:
         return None
     of_position, of_velocity, duration = _steps_over(track, track.v_n, _BASE_S, late_s)
-    # By either view, so that positions or velocities in a wrong unit do not pass for rest.
+    # By either, so that positions or velocities in a wrong unit do not look like rest.
     by_either = _moves(of_velocity, duration, track.sigma_m)
     by_either |= _moves(of_position, duration, track.sigma_m)
     if np.count_nonzero(by_either) < 10:
         return None
     either = PositionSteps(of_position[by_either], of_velocity[by_either])
-    # Of steps chosen by noisy positions, noise has made the ways longer.
+    # Choosing steps by noisy positions alone would bias their lengths upwards.
     for base_s in _BASES_S:
         of_position, of_velocity, duration = _steps_over(track, track.v_n, base_s, late_s)
         moving = _moves(of_velocity, duration, track.sigma_m)
@@ -94,14 +94,14 @@ def steps_of(track: FixTrack, late_s: float = 0.0) -> PositionSteps | None:
 
 
 def _moves(way: np.ndarray, duration: np.ndarray, sigma_m: float) -> np.ndarray:
-    """(k,) bool: ways that are longer than a receiver at rest shows."""
+    """Mask (k,) of displacements longer than those of a receiver at rest."""
     return np.linalg.norm(way[:, :2], axis=-1) > np.maximum(_SPEED * duration, 5.0 * sigma_m)
 
 
 def _steps_over(
     track: FixTrack, v_n: np.ndarray, base_s: float, late_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Change of position by positions and by velocities (k, 3) [m], and over what time (k,) [s]."""
+    """Change of position from positions and from velocities (k, 3) [m], and duration (k,) [s]."""
     time_s = track.time_s
     stride = max(1, round(base_s / float(np.median(np.diff(time_s)))))
     first = np.arange(0, len(time_s) - stride, max(1, stride // 2))
@@ -116,9 +116,9 @@ def _steps_over(
 
 
 def velocity_delay(track: FixTrack) -> float | None:
-    """Age of velocities at their stamps [s], by the positions; None if unclear.
+    """Age of velocities at their stamps [s], from the positions; None if unclear.
 
-    Many receivers give the mean velocity of the last epoch, half an epoch late.
+    Many receivers state the mean velocity of the last epoch, half an epoch late.
     """
     if track.v_n is None or np.median(np.diff(track.time_s)) > 1.1:
         return None
@@ -129,7 +129,7 @@ def velocity_delay(track: FixTrack) -> float | None:
         if steps is None:
             return None
         apart = np.sum((steps.of_position - steps.of_velocity)[:, :2] ** 2, axis=1)
-        # steps onto a reflected signal and off it say nothing of time
+        # steps due to reflected signals carry no information on the delay
         left.append(np.mean(np.sort(apart)[: max(1, round(_KEPT * len(apart)))]))
     late = lowest(lags, np.array(left))
     clear = late is not None and min(left) < 0.5 * left[len(lags) // 2]
@@ -139,7 +139,7 @@ def velocity_delay(track: FixTrack) -> float | None:
 def lowest(x: np.ndarray, y: np.ndarray) -> float | None:
     """Abscissa of the minimum of a sampled curve, by the parabola through three points.
 
-    None at an end, or beside a sample that is missing (NaN).
+    None at an end, or next to a missing sample (NaN).
     """
     if np.isnan(y).all():
         return None

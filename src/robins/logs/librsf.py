@@ -1,14 +1,14 @@
-"""Text of libRSF (Pfeifer et al., TU Chemnitz): pseudoranges, odometry and true places of a car.
+"""Text format of libRSF (Pfeifer et al., TU Chemnitz): pseudoranges, odometry and truth of a car.
 
-A line is a measurement, and its first word says of what; fields are separated by blanks::
+A line is a measurement, with its type as first word; fields are separated by blanks::
 
     pseudorange3  time, range, variance, satellite x y z (ECEF), number, system, elevation [deg],
                   C/N0 [dBHz]
     odom3         time, velocity x y z, turn rate x y z, their six variances; x forward, z up
     point3        time, x y z (ECEF), nine covariances
 
-Lines of other words are counted and left out. It is no format of `robins.logs.FORMATS`, since what
-it holds is no table of a `Dataset`: `load_ranges` puts the files of one drive together.
+Lines of other types are counted and skipped. It is not in `robins.logs.FORMATS`, since its content
+is no table of a `Dataset`: `load_ranges` combines the files of one drive.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from robins.logs.opening import Source
 from robins.logs.tables import stem_of
 from robins.logs.timebase import stamps_to_ns
 
-_STAMP = "S40"  # wider than any stamp, as `stamps_to_ns` wants it
+_STAMP = "S40"  # wider than any stamp, as required by `stamps_to_ns`
 WIDTH = {"pseudorange3": 10, "odom3": 13, "point3": 4}
-"""Numbers in a line of each kind, at least."""
+"""Least number of fields in a line of each kind."""
 RangeTables = dict[str, RangeTable | OdometryTable | PlaceTable]
 
 
 class _Lines(NamedTuple):
-    """The lines of one kind of a file: stamps as text, numbers, line numbers."""
+    """Lines of one kind in a file: stamps as text, numbers, line numbers."""
 
     stamps: list[bytes]
     values: list[list[float]]
@@ -71,7 +71,7 @@ def _columns(
     """Stamps [ns], numbers, roots of the variances in these columns, and line numbers.
 
     Raises:
-        LogError: a stamp is no number, time falls, or a number is not what it should be.
+        LogError: a stamp is no number, time decreases, or a number is invalid.
     """
     rows, values = np.asarray(lines.rows), np.array(lines.values)
     time_ns = stamps_to_ns(file, "time", np.array(lines.stamps, dtype=_STAMP), rows)
@@ -93,13 +93,13 @@ def read_librsf(path: AnyPath, findings: Findings = None) -> RangeTables:
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out.
+        findings: receives omissions.
 
     Returns:
-        What there is of "ranges", "odometry" and "truth".
+        Tables "ranges", "odometry" and "truth", as far as the file has them.
 
     Raises:
-        LogError: the file holds none of these, or a line is not what it should be.
+        LogError: the file has none of these, or a line is invalid.
     """
     file = str(path)
     kinds, others = _lines_of(path)
@@ -129,10 +129,10 @@ def read_librsf(path: AnyPath, findings: Findings = None) -> RangeTables:
 
 
 def load_ranges(paths: Iterable[AnyPath], findings: Findings = None) -> RangeLog:
-    """Read pseudoranges and odometry of a drive, and its true places where a file has them.
+    """Read pseudoranges and odometry of a drive, and its true positions if a file has them.
 
     Raises:
-        LogError: as `read_librsf`; two files hold the same, or pseudoranges or odometry are absent.
+        LogError: as `read_librsf`; two files have the same table, or one of the two is missing.
     """
     held: RangeTables = {}
     given, heard = [os.fspath(path) for path in paths], [] if findings is None else findings

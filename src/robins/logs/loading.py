@@ -1,4 +1,4 @@
-"""Several files, one `Dataset`: an IMU with GNSS, or with the master INS it is aligned to."""
+"""One `Dataset` from several files: an IMU with GNSS, or with the master INS it is aligned to."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def load_dataset(
     mounting: Mounting | None = None,
     formats: Formats | None = None,
 ) -> Dataset:
-    """Read IMU, and whatever else there is, as it is in the files; see `clean`.
+    """Read IMU and other tables, unchanged from the files; see `clean`.
 
     Args:
         paths: one, or several in any order; one IMU table in all, or one with rates and one with
-            specific forces, and at most one of each other kind; a file of its own replaces what a
-            recording has of its kind. A path in a file of its own is the truth.
+            specific forces, and at most one of each other kind; a separate file replaces the table
+            of its kind in a recording. A trajectory in a separate file is the truth.
         name: of the dataset; by default the name of the file with the IMU.
-        mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
+        mounting: rotation from sensor axes to forward-right-down, and lever arm of the antenna.
         formats: path -> its format, for files that are not recognised by content.
 
     Returns:
@@ -75,7 +75,7 @@ def load_dataset(
 def without_replaced(
     opened: Iterable[Table | Dataset], findings: list[Finding]
 ) -> list[Table | Dataset]:
-    """Contents of files, of a recording without the tables for which there is a file of its own.
+    """Contents of files, without the tables of a recording that a separate file replaces.
 
     Args:
         opened: contents of the files.
@@ -102,12 +102,12 @@ def without_replaced(
 def by_kind(
     paths: Iterable[AnyPath], opened: Iterable[Table | Dataset], findings: list[Finding]
 ) -> dict[str, Table]:
-    """One table of each kind; gyros and accelerometers that were recorded apart become one.
+    """One table of each kind; separately recorded gyros and accelerometers are merged.
 
     Args:
         paths: the files.
         opened: their contents.
-        findings: receives a note where two tables become one.
+        findings: receives a note if two tables are merged.
 
     Raises:
         LogError: two tables are of one kind.
@@ -133,21 +133,21 @@ def load_pair(
     delay_s: float = 0.0,
     formats: Formats | None = None,
 ) -> Dataset:
-    """Read what a master INS reported and the samples of the IMU to be aligned to it.
+    """Read the records of a master INS and the samples of the IMU to be aligned to it.
 
     Args:
-        master: a path in any known format; ``named-path`` can also hold turn rates.
-        slave: inertial samples in any known format, along the axes of that IMU.
+        master: a trajectory in any known format; ``named-path`` can also hold turn rates.
+        slave: inertial samples in any known format, in the axes of that IMU.
         name: of the dataset; by default the IMU file's name.
-        delay_s: by how much the records of the master are older than their stamps, for the doctor
-            to compare; the stamps stay as they are.
+        delay_s: age of the records of the master at their stamps [s], for comparison by the
+            doctor; the stamps are not changed.
         formats: as `load_dataset`.
 
     Returns:
-        The dataset, as it is in the files, with the findings of the readers; see `clean`.
+        The dataset, unchanged from the files, with the findings of the readers; see `clean`.
 
     Raises:
-        LogError: as `open_log`; or a file holds something else.
+        LogError: as `open_log`; or a file holds another kind of data.
     """
     findings: list[Finding] = []
     path = _open_as(master, "trajectory", findings, formats)
@@ -163,7 +163,7 @@ def load_pair(
 def _open_as(
     path: AnyPath, kind: str, findings: list[Finding], formats: Formats | None
 ) -> Table | Dataset | None:
-    """A file that holds several kinds of columns is read for the kind that is wanted."""
+    """Read a file; if it holds several kinds of columns, read those of the wanted kind."""
     format = (formats or {}).get(os.fspath(path))
     if format is None and not os.path.isdir(path):
         names = [f.name for f in matching_formats(path)[1] if f.holds == (kind,)]

@@ -1,4 +1,4 @@
-"""Samples of two sensors on one clock, and two clocks made one."""
+"""Merging of the samples of two sensors on one clock, and conversion between two clocks."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from robins.dataset import ImuTable
 from robins.logs.findings import Findings, LogError, finding_reporter
 
-_LONG = 5.0  # typical intervals; across a longer one no specific force is interpolated
-_DRIFT, _STRAY_S = 2e-4, 1.0  # of a clock; a stamp that is further from the others is not used
-_TREND_S = 60.0  # a drift is found from stamps over at least this time
+_LONG = 5.0  # typical intervals; no interpolation across a longer one
+_DRIFT, _STRAY_S = 2e-4, 1.0  # largest drift of a clock; largest deviation of a stamp that is used
+_TREND_S = 60.0  # shortest span of stamps to find a drift
 
 
 def are_halves(one: ImuTable, other: ImuTable) -> bool:
@@ -24,9 +24,9 @@ def are_halves(one: ImuTable, other: ImuTable) -> bool:
 def merged(gyro: ImuTable, accel: ImuTable, findings: Findings) -> ImuTable:
     """Rates of one table with the specific forces of another, on the clock of the rates.
 
-    They may be given in either order. Specific forces are interpolated linearly. Samples outside of
-    their time are left out; across a gap of more than five of their intervals the specific force is
-    missing (NaN).
+    They may be given in either order. Specific forces are interpolated linearly. Samples outside
+    their time span are omitted; across a gap of more than five of their intervals the specific
+    force is missing (NaN).
 
     Args:
         gyro: rates; its specific forces are not used.
@@ -34,7 +34,7 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: Findings) -> ImuTable:
         findings: receives a note.
 
     Raises:
-        LogError: the two share no time.
+        LogError: the two do not overlap in time.
     """
     if not np.nan_to_num(gyro.gyro).any():
         gyro, accel = accel, gyro
@@ -54,9 +54,9 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: Findings) -> ImuTable:
 
 
 def interpolated(now_ns: np.ndarray, at_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (m, 3) at other times (n,), linearly; (n, 3).
+    """Values (m, 3) interpolated linearly at other times (n,); (n, 3).
 
-    NaN outside of their time, and across a gap of more than five of their intervals.
+    NaN outside their time span, and across a gap of more than five of their intervals.
 
     Args:
         now_ns: (n,) wanted times.
@@ -76,10 +76,10 @@ def interpolated(now_ns: np.ndarray, at_ns: np.ndarray, values: np.ndarray) -> n
 def gps_clock(
     file: str, local_ns: np.ndarray, gps_ns: np.ndarray, findings: Findings
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """GPS time of a local clock that stamps fixes when they arrive.
+    """Conversion to GPS time of a local clock that stamps fixes on arrival.
 
-    The clock may drift linearly. The fix that arrived fastest is taken to have arrived at once: the
-    true delay of a receiver cannot be found from stamps, and remains as a latency of the fixes.
+    The clock may drift linearly. The fastest fix is assumed to arrive without delay: the true delay
+    of a receiver cannot be found from stamps, and remains as a latency of the fixes.
 
     Args:
         file: for messages.
@@ -91,7 +91,7 @@ def gps_clock(
         A function from local to GPS time [ns].
 
     Raises:
-        LogError: the two clocks do not run at one rate.
+        LogError: the two clocks do not run at the same rate.
     """
     begin, apart = int(local_ns[0]), int(local_ns[0]) - int(gps_ns[0])
     x, late = (local_ns - begin) * 1e-9, (local_ns - gps_ns - apart) * 1e-9

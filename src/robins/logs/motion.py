@@ -1,15 +1,16 @@
-"""One motion, seen by the IMU and by GNSS: both cut into stretches, and the search for a start.
+"""Common motion of IMU and GNSS: both cut into stretches, and the search for a start.
 
-Over a short stretch the gyros tell how the body turns, so the specific force can be added up in
-axes that do not turn. Up to one constant rotation R these sums must be what GNSS saw,
+Over a short stretch the gyros give the rotation of the body, so the specific force can be
+integrated in non-rotating axes. Up to one constant rotation R the integrals must equal those of
+GNSS,
 
     R sum(C f dt) = change of v - g dt,
 
-whatever the attitude and the mounting. R is found in closed form (Kabsch 1976), as a rotation or as
-a reflection; the squares left over judge a delay, or a matrix that the gyros are multiplied by.
-`motion_fit` goes on from the best of them.
+for any attitude and mounting. R is found in closed form (Kabsch 1976), as a rotation or as a
+reflection; the residual squares rate a delay, or a matrix applied to the gyros. `motion_fit` starts
+from the best of them.
 
-The sums are taken on a grid of 20 Hz, so vibration does not matter and an hour costs little.
+The integrals are on a grid of 20 Hz, so vibration does not matter and an hour costs little.
 """
 
 from __future__ import annotations
@@ -27,23 +28,23 @@ from robins.rotation import skew
 GRAVITY = 9.8
 RATE_HZ = 20
 EARTH_RATE = 7.292115e-5  # rad/s, WGS 84
-_STRETCH_S = 15.0  # long enough to turn, short enough for the drift of cheap gyros
-_CHANGES = 8  # of velocity in a stretch at least
+_STRETCH_S = 15.0  # long enough for turns, short enough for the drift of low-cost gyros
+_CHANGES = 8  # least number of velocity changes in a stretch
 _MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 20, 6, 8
-_SPOT_S, _MOST_SPOTS = 30, 4  # likewise of an IMU that was turned about by hand
-_GAP_S = 0.5  # without IMU samples, across which nothing is added up
-_FIX_S, _LOST_S = 0.25, 1.2  # between fixes that are used, and without one in a stretch
-_NOISE = 0.5  # m/s, of a mean velocity between fixes that are far enough apart
+_SPOT_S, _MOST_SPOTS = 30, 4  # likewise for an IMU that was turned about by hand
+_GAP_S = 0.5  # longest gap of IMU samples that is integrated over
+_FIX_S, _LOST_S = 0.25, 1.2  # least interval of fixes used; longest one in a stretch
+_NOISE = 0.5  # m/s, largest noise of a mean velocity between fixes, which sets their stride
 
-# Of steps by which something else that turned is compared with the gyros.
-_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine ones, and compared over 0.2 s
-_MOST = 1500  # steps, of those that turn most
-_LEAST = 50  # below which nothing is judged
-_TURNED = 0.1  # rad, of a step that tells something
+# Steps over which another rotating sensor is compared with the gyros.
+_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine steps, and compared over 0.2 s
+_MOST = 1500  # most steps used, those with the largest rotation
+_LEAST = 50  # fewest steps for a comparison
+_TURNED = 0.1  # rad, least rotation of a useful step
 
 
 def signed_permutations() -> np.ndarray:
-    """(48, 3, 3): all ways to exchange and reverse three axes, the identity first."""
+    """All signed permutations (48, 3, 3) of three axes, the identity first."""
     out = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
@@ -52,29 +53,29 @@ def signed_permutations() -> np.ndarray:
 
 
 class MotionIntegrals(NamedTuple):
-    """Integrals of the IMU and changes of velocity, both from one zero of time.
+    """Integrals of the IMU and changes of velocity, on a common time.
 
-    Changes are between nodes of one stretch a second apart or more; they overlap. A node is a
+    Changes are between nodes of one stretch at least a second apart; they overlap. A node is a
     velocity at a time, or the mean velocity between two positions.
     """
 
     turn: np.ndarray  # (n + 1, 3) integral of the rate up to each time of the grid [rad]
     push: np.ndarray  # (n + 1, 3) integral of the specific force [m/s]
-    gaps: np.ndarray  # (gaps, 2) begin and end of times without samples [s]
+    gaps: np.ndarray  # (gaps, 2) begin and end of gaps in the samples [s]
     begin_s: np.ndarray  # (nodes,) s
-    end_s: np.ndarray  # (nodes,) s, as `begin_s` where velocities are not means
+    end_s: np.ndarray  # (nodes,) s, equal to `begin_s` unless velocities are means
     means: bool  # nodes are mean velocities
     node_of: np.ndarray  # (nodes,) stretch of each
     v: np.ndarray  # (nodes, 3) m/s, in the axes of `gained`
     node: np.ndarray  # (k,) first node of each change
     of: np.ndarray  # (k,) stretch of each change
-    gained: np.ndarray  # (k, 3) change of v - g dt [m/s], in axes that do not turn
+    gained: np.ndarray  # (k, 3) change of v - g dt [m/s], in non-rotating axes
     start_s: np.ndarray  # (stretches,) s, first node
     length_s: float  # of the longest stretch
-    middle_s: float  # about which a rate of the clock counts
-    stride: int = 1  # nodes from the first of a change to its second
-    noise: float = 0.0  # m/s, one sigma of a change by the stated sigmas
-    power: str = "change"  # what the share left is a share of: "change" of velocity, or "gravity"
+    middle_s: float  # s, zero of the effect of a clock rate
+    stride: int = 1  # nodes between the two of a change
+    noise: float = 0.0  # m/s, one sigma of a change from the stated sigmas
+    power: str = "change"  # reference of unexplained shares: "change" of velocity, or "gravity"
 
 
 def views_of(
@@ -87,16 +88,16 @@ def views_of(
     v_n: np.ndarray | None,
     noise: tuple[float, float],
 ) -> MotionIntegrals | None:
-    """Put both on one time; None if no stretch has enough motion for a judgement.
+    """Integrals and changes on a common time; None if no stretch has enough motion.
 
     Args:
         signal: the IMU.
         kind: "rate" or "increment", of its table.
-        gnss: the table of the fixes, for their places.
-        rows: (m,) rows of it that are used.
+        gnss: the table of the fixes, for their positions.
+        rows: (m,) rows of it to use.
         when_s: (m,) times of the fixes, from the zero of the signal.
         r_n: (m, 3) positions, north-east-down [m].
-        v_n: (m, 3) velocities, north-east-down [m/s], or None: then positions serve.
+        v_n: (m, 3) velocities, north-east-down [m/s]; None: positions are used.
         noise: standard deviations of a position [m] and of a velocity [m/s].
     """
     spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if v_n is None else 1.0
@@ -137,9 +138,9 @@ def views_of(
 def _velocities(
     time_s: np.ndarray, r_n: np.ndarray, v_n: np.ndarray | None, keep: np.ndarray, stride: int
 ) -> tuple[np.ndarray, ...]:
-    """Velocities (n, 3), times at which each begins and ends, and no gap up to the next (n - 1,).
+    """Velocities (n, 3), begin and end of each (n,) [s], and True (n - 1,) if no gap follows.
 
-    They are means between positions a stride apart where the receiver gave none.
+    If the receiver gave none, they are means between positions a stride apart.
     """
     step = np.diff(time_s)
     near = step < max(2.5 * float(np.median(step)), _LOST_S)
@@ -160,9 +161,9 @@ def _lively(
     stride: int,
     end_s: float,
 ) -> list[np.ndarray]:
-    """Nodes of each stretch with enough motion: of each part of the log the liveliest.
+    """Nodes of stretches with enough motion: the one with most in each part of the log.
 
-    Most are while the IMU was recorded; the others show clocks that were set.
+    Most are within the time of the IMU; the others reveal clocks that were set.
     """
     found = []
     bounds = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
@@ -190,10 +191,10 @@ def _lively(
 def _inertial(
     since_s: np.ndarray, v_e: np.ndarray, g_e: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities, and changes of them less gravity, in axes that do not turn with the Earth.
+    """Velocities, and their changes less gravity, in axes that do not rotate with the Earth.
 
     Args:
-        since_s: (nodes,) time since the axes were those of the Earth.
+        since_s: (nodes,) time since the axes coincided with Earth-fixed ones [s].
         v_e: (nodes, 3) velocities over the Earth, along its axes [m/s].
         g_e: (nodes, 3) gravity [m/s^2].
         first: (k,) node at which a change begins.
@@ -209,23 +210,23 @@ def _inertial(
 
 
 def axes_at(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) from north-east-down to Earth-centred, Earth-fixed axes."""
+    """Matrices (n, 3, 3) from north-east-down to Earth-centred, Earth-fixed axes."""
     sp, cp, sl, cl = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     rows = ((-sp * cl, -sl, -cp * cl), (-sp * sl, cl, -cp * sl), (cp, 0.0 * sp, -sp))
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def normal_gravity(lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
-    """Gravity [m/s^2] by Somigliana's formula and the free-air gradient; 1e-4 below 30 km."""
+    """Gravity [m/s^2] by Somigliana's formula and the free-air gradient; to 1e-4 below 30 km."""
     s2 = np.sin(lat) ** 2
     on_ellipsoid = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999 * s2)
     return on_ellipsoid - 3.086e-6 * alt
 
 
 def stationary_integrals(signal: ImuSignal, kind: str) -> MotionIntegrals | None:
-    """An IMU alone, taken to stay about where it is: then gravity must not turn.
+    """Integrals of an IMU alone, assumed stationary but for rotation, so that gravity is constant.
 
-    None unless it is turned about enough that the specific force points elsewhere by 10 deg or so.
+    None unless it was rotated enough to change the direction of specific force by about 10 deg.
     """
     turn, push = on_grid(signal, kind)
     gaps, count, tilted = _gaps(signal), _SPOT_S, []
@@ -262,14 +263,14 @@ def on_grid(signal: ImuSignal, kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gaps(signal: ImuSignal) -> np.ndarray:
-    """(gaps, 2) begin and end of times without samples."""
+    """Begin and end (gaps, 2) [s] of gaps in the samples."""
     step = np.diff(signal.time_s)
     k = np.flatnonzero(step > max(_GAP_S, 3.0 * signal.step_s))
     return np.stack([signal.time_s[k], signal.time_s[k + 1]], axis=-1)
 
 
 def power_of(views: MotionIntegrals) -> np.ndarray:
-    """(stretches,) mean square of what the share left is a share of [m^2/s^2]."""
+    """Mean square (stretches,) [m^2/s^2] to which unexplained shares refer."""
     count = np.bincount(views.of)
     squares = np.bincount(views.of, np.sum(views.gained**2, axis=1)) / count
     if views.power == "gravity":
@@ -279,11 +280,11 @@ def power_of(views: MotionIntegrals) -> np.ndarray:
 
 
 def squares_by_lag(views: MotionIntegrals, lags_s: np.ndarray) -> np.ndarray:
-    """(stretches, lags) means of the squares left by tables as they are, if fixes are later.
+    """Mean residual squares (stretches, lags) [m^2/s^2] for lags added to the stamps of fixes.
 
     Args:
-        views: the tables.
-        lags_s: what is added to the stamps of fixes [s]. NaN results where no IMU was recorded.
+        views: the integrals.
+        lags_s: (lags,) added to the stamps of fixes [s]. NaN results where no IMU was recorded.
     """
     turn, push = np.diff(views.turn, axis=0), np.diff(views.push, axis=0)
     C = _attitudes(turn)
@@ -310,12 +311,12 @@ def squares_by_lag(views: MotionIntegrals, lags_s: np.ndarray) -> np.ndarray:
 
 
 def squares_by_map(views: MotionIntegrals, maps: np.ndarray, shift_s: np.ndarray) -> np.ndarray:
-    """(maps, 2) means of the squares left by the best rotation and by the best reflection, summed.
+    """Summed mean residual squares (h, 2) of the best rotation and of the best reflection.
 
     Args:
-        views: the tables.
-        maps: (h, 3, 3) that the gyros are multiplied by.
-        shift_s: (stretches,) what is added to the stamps of fixes.
+        views: the integrals.
+        maps: (h, 3, 3) matrices applied to the gyros.
+        shift_s: (stretches,) added to the stamps of fixes [s].
     """
     count = int(np.ceil(views.length_s * RATE_HZ)) + 2
     power = power_of(views)
@@ -343,7 +344,7 @@ def squares_by_map(views: MotionIntegrals, maps: np.ndarray, shift_s: np.ndarray
 
 
 def _compared(views: MotionIntegrals, s: int, v: np.ndarray) -> list[np.ndarray]:
-    """Means of the squares left (h,) of velocities (h, nodes, 3) by a rotation, by a reflection."""
+    """Mean residual squares (h,) of velocities (h, nodes, 3) by a rotation, and by a reflection."""
     once = slice(None, None, views.stride)  # changes that do not overlap
     u = (v[:, views.stride :] - v[:, : -views.stride])[:, once]
     _, *both = kabsch(u, views.gained[views.of == s][once])
@@ -360,7 +361,7 @@ def _along(index: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _attitudes(turn: np.ndarray) -> np.ndarray:
-    """(n + 1, 3, 3) attitudes after each of n small turns, in blocks that are joined then."""
+    """Attitudes (n + 1, 3, 3) after each of n small rotations, computed in blocks and joined."""
     size = int(np.sqrt(len(turn))) + 1
     count = -(-len(turn) // size)
     padded = np.concatenate([turn, np.zeros((count * size - len(turn), 3))])
@@ -371,7 +372,7 @@ def _attitudes(turn: np.ndarray) -> np.ndarray:
 
 
 def composed(steps: np.ndarray) -> np.ndarray:
-    """(b, n + 1, 3, 3) products of rotations (b, n, 3, 3) up to each."""
+    """Cumulative products (b, n + 1, 3, 3) of rotations (b, n, 3, 3)."""
     out = np.empty((steps.shape[0], steps.shape[1] + 1, 3, 3))
     out[:, 0] = np.eye(3)
     for k in range(steps.shape[1]):
@@ -380,9 +381,9 @@ def composed(steps: np.ndarray) -> np.ndarray:
 
 
 def integral(time_s: np.ndarray, rate: np.ndarray, kind: str = "rate") -> np.ndarray:
-    """(n, 3) sum of a rate (n, 3) from the first sample up to each.
+    """Integral (n, 3) of a rate (n, 3) from the first sample up to each.
 
-    By the trapezoidal rule, or of increments, whose rates are means since the sample before.
+    By the trapezoidal rule; for increments, rates are means since the previous sample.
     """
     mean = rate[1:] if kind == "increment" else 0.5 * (rate[1:] + rate[:-1])
     steps = mean * np.diff(time_s)[:, None]
@@ -390,12 +391,12 @@ def integral(time_s: np.ndarray, rate: np.ndarray, kind: str = "rate") -> np.nda
 
 
 def at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Columns of values (n, 3) interpolated linearly, held at the ends."""
+    """Values (n, 3) interpolated linearly at other times, constant beyond the ends."""
     return np.stack([np.interp(when, time_s, column) for column in values.T], axis=-1)
 
 
 def between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Linear interpolation of rows at real indices, held at the ends."""
+    """Linear interpolation of rows at real indices, constant beyond the ends."""
     index = np.clip(index, 0, len(values) - 1)
     low = np.minimum(index.astype(np.int64), len(values) - 2)
     share = (index - low)[..., None]
@@ -403,7 +404,7 @@ def between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def rotations(phi: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) matrices of rotation vectors (..., 3), by Rodrigues' formula."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], by Rodrigues' formula."""
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     K = skew(phi)
     half_sinc = np.sinc(0.5 * angle / np.pi)
@@ -411,7 +412,7 @@ def rotations(phi: np.ndarray) -> np.ndarray:
 
 
 def kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Best rotation R of u (h, k, 3) onto v (k, 3), squares left by it and by a reflection."""
+    """Best rotation R of u (h, k, 3) onto v (k, 3), residual squares of it and of a reflection."""
     U, s, Vt = np.linalg.svd(np.einsum("hki,kj->hij", u, v))
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     total = np.sum(u * u, axis=(1, 2)) + np.sum(v * v)
@@ -430,7 +431,7 @@ class TurnSteps(NamedTuple):
 
 
 def steps_of(signal: ImuSignal, time_s: np.ndarray) -> TurnSteps | None:
-    """The steps that turn most; None if there are too few.
+    """Steps with the largest rotation; None if there are too few.
 
     Args:
         signal: the IMU.
@@ -459,7 +460,7 @@ def steps_of(signal: ImuSignal, time_s: np.ndarray) -> TurnSteps | None:
 
 
 def _recorded(grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(len(grid) - 1,) whether there is no gap in the samples around each step."""
+    """Mask (len(grid) - 1,) of the steps without a gap in the samples around them."""
     before = np.searchsorted(time_s, grid[:-1], side="right") - 1
     after = np.searchsorted(time_s, grid[1:], side="left")
     span = time_s[np.minimum(after, len(time_s) - 1)] - time_s[np.maximum(before, 0)]

@@ -1,18 +1,18 @@
-"""One least-squares problem for an IMU and a receiver as views of one motion.
+"""Least-squares fit of an IMU and a receiver to their common motion.
 
-Over a stretch of time the gyros give the turn C of the body since its first moment, so the gained
-velocity of the antenna in axes that do not turn is, up to one rotation R of the stretch,
+Over a stretch of time the gyros give the rotation C of the body since its begin, so the velocity
+gained by the antenna in non-rotating axes is, up to one rotation R of the stretch,
 
     R (sum C (M_a f - b_a) dt + C (w x l)) = change of v - g dt,   w = M_g w_m - b_g,
 
 at the times t + offset + rate t of the clock of the IMU. Unknown are the matrices M_g and M_a (up
 to a common rotation, so M_a is upper triangular), the biases, the lever arm l, the clock, and R.
-All but the clock, and M_g, M_a beyond a few percent, are nuisances of every model: a model is a
-set of standard deviations of what may differ from its start, and a wide one frees a block.
+All but the clock, and M_g, M_a beyond a few percent, are nuisance parameters of every model: a
+model is a set of prior standard deviations about the start, and a wide one frees a block.
 
-Residuals of a stretch are correlated, so a sigma is the larger of that by white residuals and that
-by the scores of the stretches (Liang and Zeger 1986). R is in closed form (Kabsch 1976). Velocities
-are turned into axes that are inertial during a stretch, so the turns of the Earth cost nothing.
+Residuals of a stretch are correlated, so a sigma is the larger of that for white residuals and that
+from the scores of the stretches (Liang and Zeger 1986). R is in closed form (Kabsch 1976).
+Velocities are in axes that are inertial during a stretch, so Earth rate needs no terms.
 """
 
 from __future__ import annotations
@@ -36,48 +36,48 @@ SCALE, GYRO_BIAS, FORCE, FORCE_BIAS = slice(0, 9), slice(9, 12), slice(12, 18), 
 LEVER, RATE, OFFSET = slice(21, 24), 24, 25  # an offset for each part of the log
 _UPPER = np.triu_indices(3)
 _PAD_S, _SMOOTH_S, _EDGE_S = 0.5, 0.1, 0.1
-_MOST, _MOST_BIAS, _MOST_LEVER_M = 0.3, 1.0, 5.0  # of a step of Gauss and Newton
-_STILL = 0.03  # sigmas of a step that ends the search
-_TRIMMED = 0.95  # share of the residuals that judges a fit, the smallest
-_ROBUST = 3.0  # typical residuals, beyond which one counts less
+_MOST, _MOST_BIAS, _MOST_LEVER_M = 0.3, 1.0, 5.0  # largest steps of Gauss-Newton
+_STILL = 0.03  # step, in sigmas, that ends the iteration
+_TRIMMED = 0.95  # share of the residuals, the smallest, that rates a fit
+_ROBUST = 3.0  # typical residuals; larger ones have less weight
 
 
 class PairState(NamedTuple):
     """Estimated or assumed parameters."""
 
-    M_g: np.ndarray  # (3, 3) angular rates are multiplied by it
-    b_g: np.ndarray  # (3,) rad/s, taken off then
-    M_a: np.ndarray  # (3, 3) specific forces are multiplied by it
-    b_a: np.ndarray  # (3,) m/s^2, taken off then
+    M_g: np.ndarray  # (3, 3) applied to angular rates
+    b_g: np.ndarray  # (3,) rad/s, subtracted afterwards
+    M_a: np.ndarray  # (3, 3) applied to specific forces
+    b_a: np.ndarray  # (3,) m/s^2, subtracted afterwards
     lever: np.ndarray  # (3,) m from the IMU to the antenna, body axes
     rate: float  # s/s, added to the stamps of fixes for each second from the middle
     offset: np.ndarray  # (parts,) s, added to the stamps of fixes
-    part: np.ndarray  # (stretches,) part of the log in which each lies
+    part: np.ndarray  # (stretches,) part of the log of each
 
     def shift(self, stretch: np.ndarray, time_s: np.ndarray, middle_s: float) -> np.ndarray:
-        """Seconds to be added to stamps of fixes."""
+        """Correction [s] to the stamps of fixes at times [s] of stretches."""
         return self.offset[self.part[stretch]] + self.rate * (time_s - middle_s)
 
 
 class MotionFit(NamedTuple):
-    """A model fitted."""
+    """A fitted model."""
 
     state: PairState
-    sigma: np.ndarray  # (parameters,) one sigma, relative ones of the matrices
+    sigma: np.ndarray  # (parameters,) one sigma; relative for the matrices
     R: np.ndarray  # (stretches, 3, 3) from the first axes of each to those of its velocities
-    squares: np.ndarray  # (k,) squares left of each change of velocity; NaN where no IMU was
+    squares: np.ndarray  # (k,) residual square of each change of velocity; NaN without IMU
     turned: np.ndarray  # (nodes, 3, 3) attitude C at each node
-    strain: float = 0.0  # chi-square of the parameters against what they were expected to be
+    strain: float = 0.0  # chi-square of the parameters relative to their prior
 
     def left(self, views: MotionIntegrals) -> float:
-        """Share of the change of velocity that is left unexplained; infinite where no IMU was."""
+        """Unexplained share of the change of velocity; infinite without IMU."""
         seen = np.isfinite(self.squares)
         if not seen.any():
             return np.inf
         return trimmed(self.squares[seen]) / float(np.mean(power_of(views)[views.of[seen]]))
 
     def by_stretch(self, views: MotionIntegrals) -> np.ndarray:
-        """(stretches,) mean of the squares left; all of the change where no IMU was."""
+        """Mean residual squares (stretches,); those of the whole change without IMU."""
         power, out = power_of(views), np.empty(len(views.start_s))
         for s in range(len(out)):
             mine = self.squares[views.of == s]
@@ -93,7 +93,7 @@ def trimmed(squares: np.ndarray) -> float:
 def start_of(
     views: MotionIntegrals, M_g: np.ndarray | None = None, mirror: float = 1.0
 ) -> PairState:
-    """PairState in which tables are what they claim to be, or the gyros need a map."""
+    """Initial state: tables as labelled, with an optional matrix for the gyros."""
     zero, eye = np.zeros(3), np.eye(3)
     part = np.zeros(len(views.start_s), int)
     M_g = eye if M_g is None else M_g
@@ -140,7 +140,7 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
         near = [at(end + k * _SMOOTH_S * RATE_HZ, S[..., :1]) for k in (-1, 1)]
         force = (near[1] - near[0]) / (2 * _SMOOTH_S)
         angle = _cumulative(dphi)
-        # by two differences (Richardson), for a mean over 0.2 s would lose the swing of a step
+        # by two differences (Richardson), since a mean over 0.2 s would smooth the motion of a step
         ends = [at(end + k, angle) for k in (-2, -1, 1, 2)]
         omega = (8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) * (RATE_HZ / 12.0)
         swing = C_end @ skew(omega)
@@ -162,10 +162,10 @@ def _grown(
     """Velocity with its derivatives by the parameters of the triads, and attitude.
 
     Args:
-        turn: (stretches, fine, 3) small turns, biases not yet taken off [rad].
-        push: (stretches, fine, 3) small gains of velocity in body axes, likewise [m/s].
-        dphi: (stretches, fine, 3) small turns [rad].
-        dp: (stretches, fine, 3) small gains of velocity in body axes [m/s].
+        turn: (stretches, fine, 3) small rotations before bias correction [rad].
+        push: (stretches, fine, 3) small velocity increments in body axes, likewise [m/s].
+        dphi: (stretches, fine, 3) small rotations [rad].
+        dp: (stretches, fine, 3) small velocity increments in body axes [m/s].
 
     Returns:
         (stretches, fine + 1, 3, 22) and (stretches, fine + 1, 3, 3).
@@ -189,20 +189,20 @@ def _cumulative(steps: np.ndarray) -> np.ndarray:
 
 
 def _recorded(views: MotionIntegrals, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(stretches,) whether the IMU was recorded without a gap from first to last."""
+    """Mask (stretches,) of those with IMU samples without a gap from first to last."""
     inside = (first > -_EDGE_S) & (last < (len(views.turn) - 1) / RATE_HZ + _EDGE_S)
     begin, end = views.gaps.T
     return inside & ~np.any((begin < last[:, None]) & (end > first[:, None]), axis=1)
 
 
 def fit(views: MotionIntegrals, start: PairState, prior: np.ndarray, rounds: int = 8) -> MotionFit:
-    """Fit all parameters by Gauss and Newton.
+    """Fit all parameters by Gauss-Newton.
 
     Args:
-        views: the tables.
-        start: where to start; also what the parameters are expected to be.
-        prior: (parameters, parameters) covariance of what they differ from that by.
-        rounds: steps at most.
+        views: the integrals.
+        start: initial state, which is also the prior mean.
+        prior: (parameters, parameters) prior covariance.
+        rounds: largest number of steps.
     """
     state, cost = start, np.inf
     result, step = _step(views, state, start, prior)
@@ -238,7 +238,7 @@ def _moved(state: PairState, step: np.ndarray) -> PairState:
 
 
 def _moved_by(state: PairState, start: PairState) -> np.ndarray:
-    """Parameters by which a state differs from a start."""
+    """Parameters of a state relative to a start."""
     E_g = state.M_g @ np.linalg.inv(start.M_g) - np.eye(3)
     E_a = state.M_a @ np.linalg.inv(start.M_a) - np.eye(3)
     return np.concatenate(
@@ -253,7 +253,7 @@ def _moved_by(state: PairState, start: PairState) -> np.ndarray:
 def _step(
     views: MotionIntegrals, state: PairState, start: PairState, prior: np.ndarray
 ) -> tuple[MotionFit, np.ndarray]:
-    """Judgement of a state, and the step from it."""
+    """Evaluation of a state, and the Gauss-Newton step from it."""
     u, C, recorded = _sums(views, state)
     count, stretches = u.shape[2] - 1, len(views.start_s)
     R = np.tile(np.eye(3), (stretches, 1, 1))
@@ -272,7 +272,7 @@ def _step(
             A = (R[s] @ u[k, :, 1:]).reshape(-1, count)
             B = -skew(u[k, :, 0] @ R[s].T).reshape(-1, 3)
             w, r = np.repeat(weight[k], 3), rest[k].ravel()
-            # what a turn of the stretch would explain is no evidence for the others
+            # what a rotation of the stretch explains is no evidence for other parameters
             inside = B.T @ (w[:, None] * B) + 1e-9 * np.eye(3)
             A = A - B @ np.linalg.solve(inside, B.T @ (w[:, None] * A))
             r = r - B @ np.linalg.solve(inside, B.T @ (w * r))
@@ -294,11 +294,11 @@ def _step(
 
 
 def prior_of(parts: int = 1, *free: str) -> np.ndarray:
-    """Covariance of what sound tables differ by from what they claim, wide where blocks are free.
+    """Prior covariance of the parameters: that of sound tables, wide for free blocks.
 
     Args:
-        parts: parts of the log with a clock of their own.
-        free: among "offset", "rate", "scale" (one of all gyros), "gyros", "forces".
+        parts: number of parts of the log with separate clock offsets.
+        free: among "offset", "rate", "scale" (common to all gyros), "gyros", "forces".
     """
     sigma = np.empty(OFFSET + parts)
     sigma[SCALE] = 0.3 if "gyros" in free else 0.02

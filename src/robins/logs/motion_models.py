@@ -1,9 +1,9 @@
-"""The choice of a model for an IMU and a receiver: nothing wrong, a clock, the gyros, the forces.
+"""Model selection for an IMU and a receiver: no fault, or one of clock, gyros, accelerometers.
 
-All models have the same nuisances (`motion_fit`). A block is freed only where that lowers the
-squares left by far more than chance does: by the likelihood ratio, of which a third counts, since
-residuals of neighbouring changes of velocity are correlated. It is a cause only where no other
-block does about as well.
+All models have the same nuisance parameters (`motion_fit`). A block is freed only if that lowers
+the residual squares far more than by chance: by the likelihood ratio, a third of which counts, as
+residuals of neighbouring changes of velocity are correlated. It is a cause only if no other block
+fits about as well.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from robins.logs.motion import (
 from robins.logs.motion_fit import MotionFit, PairState, fit, prior_of, start_of
 from robins.logs.quiet import ImuSignal, usual_force, windows_of
 
-SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # of gyros, where a fit may start
+SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # gyro scales at which a fit may start
 _BLOCKS = {
     "clock": ("offset", "rate"),
     "scale": ("scale",),
@@ -36,40 +36,40 @@ _BLOCKS = {
 }
 _COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
-_SUSPICIOUS = 0.02, 0.3  # shares left, of all and of a stretch, from which starts are searched
+_SUSPICIOUS = 0.02, 0.3  # unexplained shares, of all and of a stretch, to search starts
 _NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.1, 0.5
-_NOISY = 1.25  # squares of the stated noise that noise may leave
-_SWITCH = 40.0, 12.0  # log-likelihood that a step of the clock must gain, to be tried
+_NOISY = 1.25  # residual squares, relative to the stated noise, that count as noise
+_SWITCH = 40.0, 12.0  # log-likelihoods that a clock step must gain to be tried
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
-_PART = 5.0  # log-likelihood that each of its parts must gain
-_PROMISING = {"clock": 3, "gyros": 2}  # starts of which a fit is tried
+_PART = 5.0  # log-likelihood that each part with an own offset must gain
+_PROMISING = {"clock": 3, "gyros": 2}  # number of starts from which a fit is tried
 _ROUNDS = 14
-_LEAST_SHARE = 1e-4  # left, below which nothing is gained
+_LEAST_SHARE = 1e-4  # unexplained share below which no block is freed
 
 
 class ModelChoice(NamedTuple):
-    """The model chosen."""
+    """The selected model."""
 
     views: MotionIntegrals
-    nothing: MotionFit  # with nuisances only
-    clocked: MotionFit  # likewise, and the clock free
-    fit: MotionFit  # with the blocks that are free
-    free: tuple[str, ...]  # "clock", "gyros", "forces", in the order of what they explain
-    rival: str  # a block that explains nearly as much as the first, or ""
-    factor: float  # by which specific forces were multiplied before, as gravity suggested
+    nothing: MotionFit  # with nuisance parameters only
+    clocked: MotionFit  # likewise, with a free clock
+    fit: MotionFit  # with the free blocks
+    free: tuple[str, ...]  # "clock", "gyros", "forces", by decreasing improvement
+    rival: str  # a block that fits nearly as well as the first, or ""
+    factor: float  # applied to specific forces beforehand, from gravity
 
 
 def judge(
     imu: ImuTable, gnss: GnssTable, signal: ImuSignal, track: FixTrack, late_s: float | None = None
 ) -> ModelChoice | None:
-    """Choose a model; None if there is too little motion.
+    """Select a model; None if there is too little motion.
 
     Args:
         imu: the table of the signal.
         gnss: the table of the track.
         signal: usable samples.
         track: complete fixes.
-        late_s: age of velocities at their stamps; by default as the positions tell.
+        late_s: age of velocities at their stamps [s]; None: found from the positions.
     """
     scaled, factor = _at_rest(signal, track)
     if scaled is None:
@@ -85,12 +85,12 @@ def judge(
 
 
 def _at_rest(signal: ImuSignal, track: FixTrack) -> tuple[ImuSignal | None, float]:
-    """Signal without the bias of the gyros at rest, in m/s^2 by a factor if gravity needs one."""
+    """Signal corrected for the gyro bias at rest, and the factor that scales gravity to m/s^2."""
     windows = windows_of(signal)
     size, bias = usual_force(windows), np.zeros(3)
     if not size > 0.0:
         return None, 1.0
-    # A steady turn in the air looks like rest to an IMU, not to a receiver.
+    # a steady turn in flight looks like rest to an IMU, not to a receiver
     if windows.at_rest.any() and _stood(track):
         bias = np.median(windows.gyro[windows.at_rest], axis=0)
     off = size / GRAVITY
@@ -99,7 +99,7 @@ def _at_rest(signal: ImuSignal, track: FixTrack) -> tuple[ImuSignal | None, floa
 
 
 def _stood(track: FixTrack) -> bool:
-    """Judge by the fixes whether the vehicle stood for three seconds."""
+    """True if, by the fixes, the vehicle stood for three seconds."""
     step = np.diff(track.time_s)
     moved = np.diff(track.r_n, axis=0) / step[:, None]
     v = moved if track.v_n is None else track.v_n[1:]
@@ -108,7 +108,7 @@ def _stood(track: FixTrack) -> bool:
 
 
 def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str]:
-    """Fits of `ModelChoice`, the blocks that are free, and a rival of the first."""
+    """Fits of `ModelChoice`, the free blocks, and the rival of the first."""
     nothing = fit(views, start_of(views), prior_of())
     best, clocked, free, rival = nothing, nothing, (), ""
     for _ in range(2):
@@ -128,7 +128,7 @@ def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tup
             rival = others[0]
         best, free = fits[first], (*free, first)
         if best.left(views) * float(np.mean(power_of(views))) < _NOISY * views.noise**2:
-            break  # nothing is left to be explained
+            break  # everything is explained
     return nothing, clocked, best, free, rival
 
 
@@ -146,13 +146,13 @@ def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str,
         promising = np.argsort(seen)[-_PROMISING.get(block, 1) :]
         trials = [trials[k] for k in promising]
     fits = [fit(views, start, prior, _ROUNDS) for start, prior in trials]
-    # a part of the log with an offset of its own must be worth it
+    # an extra offset for a part of the log must pay off
     gains = [_gain(views, best, one) - _PART * len(one.state.offset) for one in fits]
     return fits[int(np.argmax(gains))]
 
 
 def _gain(views: MotionIntegrals, before: MotionFit, after: MotionFit) -> float:
-    """Log-likelihood gained, of which a third counts; each stretch has a variance of its own."""
+    """A third of the gain of log-likelihood, with a variance for each stretch."""
     least = _LEAST_SHARE * float(np.median(power_of(views)))
     one, other = (np.log(f.by_stretch(views) + least) for f in (before, after))
     strain = (before.strain - after.strain) / 3.0
@@ -167,7 +167,7 @@ def _starts(
     out, power = [state], power_of(views)
     share, noise = best.by_stretch(views) / power, views.noise**2 / power
     usual = _NOISY * views.noise**2 / float(np.mean(power))
-    if block != "clock":  # a step of a second explains less than that
+    if block != "clock":  # not for a clock, of which a step of a second explains less
         usual = max(_SUSPICIOUS[0], usual)
     if best.left(views) < usual and np.all(share < np.maximum(_SUSPICIOUS[1], 4.0 * noise)):
         return out
@@ -181,7 +181,7 @@ def _starts(
 
 
 def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> PairState:
-    """State of the free blocks; nuisances start again from the claims of the tables."""
+    """State with the free blocks kept; nuisance parameters restart from the tables as labelled."""
     out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
     if "clock" in free:
         out = out._replace(offset=state.offset, rate=state.rate, part=state.part)
@@ -191,7 +191,7 @@ def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> P
 
 
 def _clocks(views: MotionIntegrals) -> list[PairState]:
-    """Offset and rate, and offsets of parts, that explain most."""
+    """Clock states that fit best: offset and rate, and offsets of parts."""
     last = (len(views.turn) - 1) / RATE_HZ
     far = min(max(last, float(views.end_s[-1])), _FAR_S)
     lags = np.arange(-_NEAR_S, _NEAR_S + 0.1, _FINE_S)
@@ -201,7 +201,7 @@ def _clocks(views: MotionIntegrals) -> list[PairState]:
     squares = squares_by_lag(views, lags)
     changes = np.bincount(views.of)[:, None] / views.stride
     power = power_of(views)
-    # where no IMU was, or it stood: all is left
+    # without IMU, or at rest: nothing is explained
     missing = np.isnan(squares)
     left = np.where(missing, power[:, None], squares)
     cost = changes * np.log(left + 1e-3 * np.median(power))
@@ -229,7 +229,7 @@ def _line(
 
 
 def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray, switch: float) -> PairState:
-    """Offsets of parts: the path of least cost, which pays for each step (Viterbi 1967)."""
+    """Offsets of parts: the path of least cost, with a penalty for each step (Viterbi 1967)."""
     total, before = cost[0], []
     for row in cost[1:]:
         k = int(np.argmin(total))
@@ -246,7 +246,7 @@ def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray, switch: float) 
 
 
 def _maps(views: MotionIntegrals, state: PairState, axes: np.ndarray) -> list[PairState]:
-    """Maps of the gyros that explain most: one of some orders and signs of axes, and a factor."""
+    """Gyro matrices that fit best: a signed permutation among `axes`, times a factor."""
     shift = state.shift(np.arange(len(views.start_s)), views.start_s, views.middle_s)
     scale, out = 1.0, []
     for _ in range(2):

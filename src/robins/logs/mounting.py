@@ -1,6 +1,6 @@
-"""Mounting of the IMU: sensor axes into forward-right-down, and the antenna's place.
+"""Mounting of the IMU: sensor axes to forward-right-down, and lever arm of the antenna.
 
-A trajectory in local metres is one in east, north, up about an origin; there and back without
+Also conversion of trajectories to local metres, east, north, up about an origin, and back, without
 drift.
 """
 
@@ -62,7 +62,7 @@ class Origin(NamedTuple):
 
 
 def to_local(trajectory: Trajectory, origin: Origin) -> LocalPath:
-    """A trajectory in the axes of the origin, curvature of the Earth included."""
+    """Trajectory in the axes of the origin, with the curvature of the Earth."""
     C_el, r0_e = origin._axes()
     r_e = np.asarray(ecef_from_geodetic(trajectory.lat_rad, trajectory.lon_rad, trajectory.alt_m))
     C_ln = C_el.T @ _axes_at(trajectory.lat_rad, trajectory.lon_rad, trajectory.nav)
@@ -75,9 +75,9 @@ def to_local(trajectory: Trajectory, origin: Origin) -> LocalPath:
 
 
 def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
-    """The trajectory, along east, north, up of each place on the way; body axes stay."""
+    """Trajectory in east, north, up at each of its places; body axes are unchanged."""
     C_el, r0_e = origin._axes()
-    with np.errstate(invalid="ignore"):  # what is infinite has no place: NaN, for `clean` to count
+    with np.errstate(invalid="ignore"):  # infinite coordinates become NaN, for `clean` to count
         r_e = r0_e + path.r_l @ C_el.T
     try:
         lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
@@ -91,13 +91,13 @@ def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
 
 
 def _axes_at(lat_rad: np.ndarray, lon_rad: np.ndarray, nav: str) -> np.ndarray:
-    """(n, 3, 3) C_en of the navigation axes at each place."""
+    """C_en (n, 3, 3) of the navigation axes at each place."""
     C_en = np.asarray(dcm_en(lat_rad, lon_rad))
     return C_en @ SWAP if nav == "ENU" else C_en
 
 
 def _compose(C: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternion of C after q."""
+    """Quaternions of the product of matrices C and the rotations of q."""
     turned = rotation.multiply(rotation.from_dcm(jnp.asarray(C)), jnp.asarray(q, float))
     return np.asarray(turned)
 
@@ -109,8 +109,8 @@ OnBoard = TypeVar("OnBoard", bound=ImuTable | MagTable | AttitudeTable)
 class Mounting:
     """Orientation of the sensor and lever arm of the GNSS antenna.
 
-    The angles are roll, pitch, yaw (Z-Y-X) of the vehicle's forward-right-down axes as seen from
-    the sensor's axes. GNSS_IMU calls them `imu_misalign`; for its walk they are 180, 0, -90 deg: a
+    The angles are roll, pitch, yaw (Z-Y-X) of the vehicle's forward-right-down axes relative to
+    the sensor axes. GNSS_IMU calls them `imu_misalign`; for its walk they are 180, 0, -90 deg: a
     sensor whose x points left, y backward and z up.
     """
 
@@ -118,7 +118,7 @@ class Mounting:
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
     lever_arm_b_m: tuple[float, float, float] | None = None
-    """From the IMU to the antenna, forward, right, down; None leaves it to who uses the log."""
+    """From the IMU to the antenna, forward, right, down [m]; None: left to the user of the log."""
 
     def dcm_bs(self) -> np.ndarray:
         """(3, 3) C_bs: maps sensor axes to body axes; exact where the angles are right angles.
@@ -127,7 +127,7 @@ class Mounting:
             ValueError: an angle is not finite.
         """
         C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*self._angles()))).T
-        # Turns by right angles only exchange axes, so a rounding of 1e-16 must not mix them.
+        # Rotations by right angles only permute axes, so rounding of 1e-16 must not mix them.
         whole = np.round(C_bs)
         return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
 
@@ -138,10 +138,10 @@ class Mounting:
         return angles
 
     def turn(self, table: OnBoard) -> OnBoard:
-        """The same samples, field or attitude along body axes, forward-right-down.
+        """Rotate samples, field or attitude to body axes, forward-right-down.
 
-        An attitude sensor to navigation becomes body to navigation: q_nb = q_ns q_sb. What lies
-        along right-forward-up is first named forward-right-down.
+        An attitude sensor to navigation becomes body to navigation: q_nb = q_ns q_sb. Data in
+        right-forward-up are first converted to forward-right-down.
         """
         if table.body != "FRD":
             table = _relabelled(table)
@@ -159,10 +159,10 @@ class Mounting:
 
 
 def turned(opened: T, mounting: Mounting | None) -> T:
-    """A table or dataset with all that lies along sensor axes turned to the body's.
+    """Table or dataset with all data in sensor axes rotated to body axes.
 
-    Fixes and paths stay as they are, and so does everything where there is no mounting. A dataset
-    takes the lever arm along.
+    Fixes and paths are unchanged, and so is everything without a mounting. A dataset gets the lever
+    arm.
 
     Raises:
         LogError: a dataset without GNSS is given a lever arm, or one that is not finite.
@@ -192,14 +192,14 @@ def _lever_arm(dataset: Dataset, mounting: Mounting) -> tuple[float, float, floa
 
 
 def _relabelled(table: OnBoard) -> OnBoard:
-    """Table in forward-right-down; the navigation axes of an attitude stay."""
+    """Table in forward-right-down; the navigation axes of an attitude are unchanged."""
     if isinstance(table, AttitudeTable) and table.nav == "ENU":
         return dataclasses.replace(to_ned_frd(dataclasses.replace(table, nav="NED")), nav="ENU")
     return to_ned_frd(table)
 
 
 def _turned(C_bs: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """C_bs @ v by rows. A zero entry takes no part, so NaN on one axis does not reach another."""
+    """C_bs @ v by rows. Zero entries are skipped, so NaN on one axis does not spread to another."""
     out = np.zeros_like(vectors)
     for i, j in zip(*np.nonzero(C_bs), strict=True):
         out[:, i] += C_bs[i, j] * vectors[:, j]

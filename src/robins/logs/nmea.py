@@ -1,13 +1,13 @@
-"""Sentences of NMEA 0183 that a receiver wrote, whatever else stands between them.
+"""Sentences of NMEA 0183 from a receiver, with any other data between them.
 
 - ``GGA``, else ``GNS``: fixes; the height above the ellipsoid is the altitude plus the separation
-  of the geoid. Where a fix lacks that, all heights are altitudes above the geoid, with a warning.
-- ``RMC``, else ``VTG``: velocity over ground; there is none down. An epoch without GGA and GNS has
-  the place of its RMC, without a height; where all lack one, it is assumed, with a warning.
-- ``GST``: sigmas of the place. Others are the usual ones of the kind of a fix, see `fix_kinds`.
+  of the geoid. If a fix lacks that, all heights are altitudes above the geoid, with a warning.
+- ``RMC``, else ``VTG``: velocity over ground, without the down component. An epoch without GGA and
+  GNS has the position of its RMC, without height; if all lack one, it is assumed, with a warning.
+- ``GST``: sigmas of position. Others are the usual ones of the kind of a fix, see `fix_kinds`.
 - ``RMC`` and ``ZDA``: the date. Stamps are UTC and become GPS time.
 
-Sentences without a right checksum are left out and counted. Of several talkers GN counts, or the
+Sentences without a valid checksum are skipped and counted. Of several talkers GN is used, or the
 first. Source: NMEA 0183 4.11; u-blox F9 HPG 1.32 interface description, UBX-22008968.
 """
 
@@ -49,12 +49,12 @@ _DAY_NS, _EPOCH = 86_400_000_000_000, datetime.date(1970, 1, 1).toordinal()
 _KIND = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 8: 5}  # quality of GGA -> that of RTKLIB
 _MODES = {"R": 4, "F": 5, "D": 2, "P": 3, "A": 1, "S": 8, "E": 6, "M": 7}  # best first -> of GGA
 _NO_FIX = {6: "estimated by dead reckoning", 7: "entered by hand"}
-_ANY_HEIGHT_M = 1000.0  # sigma of a height that nothing states, so that INS can do without
-_SLOW = 0.05  # m/s, below which receivers leave out the course
+_ANY_HEIGHT_M = 1000.0  # sigma of an assumed height, so large that an INS ignores it
+_SLOW = 0.05  # m/s, below which receivers omit the course
 
 
 def is_nmea(head: Head) -> bool:
-    """Has a line with any sentence among the first bytes; see `ubx.is_ubx` for mixed ones."""
+    """True if the first bytes have a line with any sentence; see `ubx.is_ubx` for mixed files."""
     return _BEGINS.search(head.start) is not None
 
 
@@ -63,16 +63,16 @@ def read_nmea(path: AnyPath, findings: Findings = None) -> GnssTable:
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out or assumed; without it that is issued as `LogWarning`.
+        findings: receives omissions and assumptions; without it they are issued as `LogWarning`.
 
     Raises:
-        LogError: there is no sentence GGA or RMC with a right checksum.
+        LogError: there is no sentence GGA or RMC with a valid checksum.
     """
     return fixes_of(str(path), map_file(path, findings), findings)[0]
 
 
 def fixes_of(file: str, data: Bytes, findings: Findings) -> tuple[GnssTable, np.ndarray]:
-    """Fixes, and where in the bytes the first sentence of each lies; errors as `read_nmea`."""
+    """Fixes, and the byte position of the first sentence of each; errors as `read_nmea`."""
     epochs = _epochs(file, data, findings)
     days = _days(file, epochs, findings)
     kept = [k for k, epoch in enumerate(epochs) if "lat1" in epoch or "lat2" in epoch]
@@ -84,7 +84,7 @@ def fixes_of(file: str, data: Bytes, findings: Findings) -> tuple[GnssTable, np.
         return np.array([epochs[k].get(name, math.nan) for k in kept])
 
     def of_place(name: str) -> np.ndarray:
-        """A number of GGA or GNS, in an epoch without these of RMC."""
+        """A number of GGA or GNS, or of RMC in an epoch without these."""
         return np.where(np.isin(kept, without), column(f"{name}2"), column(f"{name}1"))
 
     without = [k for k in kept if "lat1" not in epochs[k]]
@@ -121,7 +121,7 @@ def fixes_of(file: str, data: Bytes, findings: Findings) -> tuple[GnssTable, np.
 
 
 def _report_kinds(file: str, quality: np.ndarray, without: int, findings: Findings) -> None:
-    """Report places that RMC alone states beside others, and qualities that count as no fix."""
+    """Report positions from RMC alone among others, and qualities that count as no fix."""
     reporter = partial(finding_reporter, findings, "note", "other_kinds", file)
     if 0 < without < len(quality):
         reporter(value=without)(
@@ -136,7 +136,7 @@ def _report_kinds(file: str, quality: np.ndarray, without: int, findings: Findin
 
 
 def _epochs(file: str, data: Bytes, findings: Findings) -> list[dict[str, float]]:
-    """Numbers of the sentences of each time of day; see `_in_order` for those without one."""
+    """Numbers of the sentences by time of day; `_in_order` gives one to those without."""
     epochs: list[dict[str, float]] = []
     talkers = {one[1] for one in _SENTENCE.finditer(data) if one[4]}
     wrong, left = 0, set[bytes]()
@@ -171,10 +171,10 @@ def _epochs(file: str, data: Bytes, findings: Findings) -> list[dict[str, float]
 
 
 def _in_order(data: Bytes) -> Iterator[re.Match[bytes]]:
-    """Sentences, a VTG behind one with the time of its epoch.
+    """Sentences, ordered so that a VTG follows one with the time of its epoch.
 
-    Where the first sentence is a VTG and the last is none, a VTG begins each burst and belongs to
-    the time that follows; else to the time before it.
+    If the first sentence is a VTG and the last is not, a VTG begins each burst and belongs to the
+    time that follows; else to the time before it.
     """
     first = last = None
     for last in _SENTENCE.finditer(data):
@@ -191,7 +191,7 @@ def _in_order(data: Bytes) -> Iterator[re.Match[bytes]]:
 
 
 def _quality(modes: str) -> float:
-    """Quality of GGA of the letters of GNS or RMC, a letter a constellation; the best counts."""
+    """GGA quality from the letters of GNS or RMC, one per constellation; the best counts."""
     return float(next((quality for letter, quality in _MODES.items() if letter in modes), 0))
 
 
@@ -214,7 +214,7 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
     if kind == "VTG":
         return {"speed1": number(4), "course1": number(0)}
     if not fields[0]:
-        return {}  # the receiver does not know the time yet
+        return {}  # the receiver has no time yet
     if (clock := _CLOCK.fullmatch(fields[0])) is None:
         raise ValueError
     minutes = 60 * int(clock[1]) + int(clock[2])
@@ -242,9 +242,9 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
 
 
 def _days(file: str, epochs: list[dict[str, float]], findings: Findings) -> list[int]:
-    """Day of each epoch: that it states, else that of its neighbour, with midnights between.
+    """Day of each epoch: as stated, else that of its neighbour, corrected for midnight.
 
-    Days count from 1970, or from -1 where no sentence states the date.
+    Days count from 1970, or from -1 if no sentence states the date.
     """
     midnights = [0] * len(epochs)
     for k in range(1, len(epochs)):

@@ -1,9 +1,9 @@
-"""Opening a log that may be compressed: decompressed blocks, in bounded memory, from any cut.
+"""Reading of logs that may be compressed or truncated, in blocks of bounded memory.
 
-A compressed file that merely ends early gives every byte before the cut. One that is damaged is
-refused whole: its checksum comes after the data, so nothing before it can be trusted.
+A truncated compressed file gives every byte before the cut. A damaged one is refused as a whole:
+its checksum follows the data, so nothing before it can be trusted.
 
-`write_lines` writes a log under another name first, so that no half file bears the final one.
+`write_lines` writes a log under a temporary name first, so that no partial file has the final one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ UNZSTD = "zstd -d FILE, and give the file that it writes"
 _NATIVE = "leave the format to be recognised"
 _CSV, _UNPACK = "export the columns to CSV", "unpack it first"
 _RTKLIB = "solve its positions with RTKLIB (convbin, rnx2rtkp) and give the .pos"
-_FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kind, the way in
+_FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # position, bytes there, kind, how to read it
     (0, b"PK\x03\x04", "a zip archive", _UNPACK),
     (0, _GZIP, "a gzip file in another compressed file", _UNPACK),
     (0, _XZ, "an xz file in another compressed file", _UNPACK),
@@ -83,7 +83,7 @@ _FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kin
 
 
 def foreign(start: bytes) -> tuple[str, str] | None:
-    """Kind of a file that is no text, by its first bytes, and the way in."""
+    """Kind of a file that is no text, from its first bytes, and how to read it; None for text."""
     found = ((what, fix) for at, magic, what, fix in _FOREIGN if start.startswith(magic, at))
     return next(found, None)
 
@@ -93,7 +93,7 @@ class _Gunzip:
 
     def __init__(self):
         self._inner = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
-        self._full = False  # the last output filled its limit, so more may be waiting
+        self._full = False  # the last output reached its limit, so more may be pending
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
         out = self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
@@ -114,12 +114,12 @@ class _Gunzip:
 
 
 def parts_of(path: AnyPath) -> list[Path]:
-    """Files of a recording in their order: the file itself, or those of a folder of ROS.
+    """Files of a recording in order: the file itself, or those of a ROS folder.
 
-    A folder names them in its ``metadata.yaml``, or holds one file, or files numbered _0, _1, ...
+    A folder lists them in its ``metadata.yaml``, or has one file, or files numbered _0, _1, ...
 
     Raises:
-        LogError: a folder without such files, or that lacks one of them.
+        LogError: the folder has no such files, or one of them is missing.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -145,7 +145,7 @@ def parts_of(path: AnyPath) -> list[Path]:
 class Source:
     """The bytes of a file, decompressed if it is .xz or .gz by content, in blocks.
 
-    Iterate once. Afterwards `cut` tells whether a compressed stream ended before its end mark.
+    Iterate once. Afterwards `cut` is True if a compressed stream ended before its end mark.
 
     Raises:
         LogError: the file cannot be opened or read, is damaged, or (unless `binary`) is of a kind
@@ -171,7 +171,7 @@ class Source:
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
         new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip
         decoder = new()
-        between = False  # after one stream's end mark, before another stream
+        between = False  # between the end mark of a stream and the next stream
         packed = plain = 0
 
         def decompress(data: bytes) -> bytes:
@@ -220,12 +220,12 @@ def read_beginning(path: AnyPath, size: int = 256) -> bytes:
 def map_file(path: AnyPath, findings: Findings) -> Bytes:
     """All bytes of a file; a compressed stream that ended early is reported.
 
-    A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
+    A plain file is mapped, so that it may be larger than memory; a compressed one is decompressed.
 
     Raises:
-        LogError: as `Source`; or more than 1 GiB would have to be unpacked.
+        LogError: as `Source`; or the decompressed size exceeds 1 GiB.
     """
-    read_beginning(path, 1)  # the error, if it cannot be read
+    read_beginning(path, 1)  # raises if it cannot be read
     with Path(path).open("rb") as file:
         if file.read(6).startswith((_XZ, _GZIP)):
             data, cut = read_whole(path, _LARGEST)
@@ -239,7 +239,7 @@ def map_file(path: AnyPath, findings: Findings) -> Bytes:
 
 
 def read_whole(path: AnyPath, limit: int) -> tuple[bytes, bool]:
-    """All bytes of a file, decompressed, and whether a compressed stream ended early.
+    """All bytes of a file, decompressed, and True if a compressed stream ended early.
 
     Raises:
         LogError: as `Source`; or there are more bytes than the limit.
@@ -260,7 +260,7 @@ _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 def write_lines(path: AnyPath, blocks: Iterable[str | bytes]) -> None:
     """Write text or bytes, compressed if the name ends in .xz or .gz.
 
-    An earlier file stays until the end.
+    An existing file is replaced at the end.
 
     Raises:
         LogError: the file cannot be written; no part of it is left behind.
@@ -280,7 +280,7 @@ def _write(path: Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
 
 
 def _write_and_rename(path: Path, blocks: Iterable[str | bytes]) -> None:
-    temporary = path.with_name(f".{secrets.token_hex(8)}")  # with the permissions of any new file
+    temporary = path.with_name(f".{secrets.token_hex(8)}")  # with default permissions
     temporary.touch(exist_ok=False)
     try:
         _write(temporary, path.suffix, blocks)

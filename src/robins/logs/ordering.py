@@ -1,9 +1,9 @@
-"""Which samples to refuse so that time strictly increases: as few as possible.
+"""Refusal of as few samples as possible so that time strictly increases.
 
-One principle covers every way a clock goes wrong. A duplicate or a step back by a sample costs that
-sample; a lone stamp an hour ahead costs itself, not the hour after it; a clock set back by a second
-costs a second; a recorder that restarts its clock costs the shorter of the two recordings, never
-"everything for ever". Where two choices refuse equally many, the earlier rows are kept.
+One principle covers all clock faults. A duplicate or a step back by a sample costs that sample; a
+single stamp an hour ahead costs itself, not the hour after it; a clock set back by a second costs a
+second; a recorder that restarts its clock costs the shorter of the two recordings. If two choices
+refuse equally many, the earlier rows are kept.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Rows = np.ndarray | np.bool
 
 
 def increasing(time_ns: np.ndarray) -> np.ndarray:
-    """(n,) bool: the longest strictly increasing choice of rows, the earlier rows on a tie."""
+    """Mask (n,) of the longest strictly increasing subsequence, the earlier rows on a tie."""
     keep = np.ones(len(time_ns), bool)
     if np.all(np.diff(time_ns) > 0):
         return keep
-    # Where all stamps before are earlier than all after, the two sides do not concern each other.
+    # If all stamps before a row are earlier than all after, the two sides are independent.
     latest = np.maximum.accumulate(time_ns)[:-1]
     earliest = np.minimum.accumulate(time_ns[::-1])[::-1][1:]
     bounds = np.concatenate([[0], np.flatnonzero(latest < earliest) + 1, [len(time_ns)]])
@@ -35,11 +35,11 @@ def increasing(time_ns: np.ndarray) -> np.ndarray:
 
 
 def _longest(times: list[int]) -> list[bool]:
-    """Patience sorting (Fredman 1975), O(n log n).
+    """Longest increasing subsequence by patience sorting (Fredman 1975), O(n log n).
 
-    The level of a row is the length of the longest choice that ends with it. At one level the times
-    never grow with the row, so of those that may come before the row chosen next, the first in the
-    order of recording is found by bisection.
+    The level of a row is the length of the longest subsequence that ends with it. At one level
+    times never increase with the row, so the first possible predecessor of the next chosen row is
+    found by bisection.
     """
     tops: list[int] = []
     levels: list[list[int]] = []
@@ -60,10 +60,10 @@ def _longest(times: list[int]) -> list[bool]:
 
 
 def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
-    """Counts of rows refused as duplicate, as backward and as ahead of what follows."""
+    """Counts of rows refused as duplicate, as backward and as ahead of the following ones."""
     refused = np.flatnonzero(~keep)
     kept = np.flatnonzero(keep)
-    at = np.searchsorted(kept, refused) - 1  # the last row kept before each; -1: none
+    at = np.searchsorted(kept, refused) - 1  # last kept row before each; -1: none
     before = time_ns[kept[np.maximum(at, 0)]]
     times = time_ns[refused]
     return {
@@ -76,13 +76,13 @@ def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
 def refusals(
     kind: str, time_ns: np.ndarray, have: Rows, refused: Mapping[str, Rows]
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Which of the rows that have something are in order, and how many are not used, by reason.
+    """Mask (n,) of the rows with data that are in order, and counts of refused ones by reason.
 
     Args:
-        kind: of the table, with which the reasons begin.
+        kind: of the table, prefix of the reasons.
         time_ns: (n,) stamps.
-        have: (n,) bool: rows to choose from.
-        refused: reason -> (n,) bool: rows in which something was refused before.
+        have: (n,) bool, rows to choose from.
+        refused: reason -> (n,) bool, rows with values refused before.
     """
     keep = np.zeros(len(time_ns), bool)
     keep[have] = increasing(time_ns[have])
@@ -92,7 +92,7 @@ def refusals(
 
 
 def rows_where(table: Any, keep: np.ndarray) -> Any:
-    """A table of `robins.dataset` with only some of its rows, (n,) bool."""
+    """A table of `robins.dataset` with the rows of a mask (n,)."""
     n = len(table.time_ns)
     arrays = {
         f.name: getattr(table, f.name)[keep]

@@ -1,9 +1,9 @@
-"""A master INS and the IMU to be aligned to it as views of one motion, for the doctor.
+"""Common motion of a master INS and the IMU to be aligned to it, for the doctor.
 
-Between its records the master turns and gains velocity; the IMU says by how much. What differs
-between the two on a healthy vehicle is small and linear, so it is fitted and taken out: a bias of
-each triad, an error of the mounting, the delay of the records, the lever arm. What is left over is
-noise and flexure, unless the records are not what they are said to be. All is NumPy, in NED/FRD.
+The rotation and velocity change between records of the master are also measured by the IMU. On a
+healthy vehicle their differences are small and linear, so they are fitted and removed: a bias of
+each triad, a mounting error, the delay of the records, the lever arm. The residual is noise and
+flexure, unless the records are not as labelled. All in NumPy, NED/FRD.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from robins.logs.quiet import signal_of
 from robins.rotation import skew
 
 GRAVITY = 9.80665  # m/s^2
-_WINDOW_S = 0.5  # at most, so that the body hardly turns meanwhile
+_WINDOW_S = 0.5  # longest window, in which the body hardly turns
 _LONGEST_S = 2.0
-_HALF_S = 0.05  # over which the gyros give a rate, to either side
+_HALF_S = 0.05  # half width of the mean of gyro rates
 LAGS_S = np.arange(-10, 11) * 0.1
 
 
 class SharedMotion(NamedTuple):
     """Records of the master about half a second apart, and the IMU's integrals; w windows."""
 
-    time_s: np.ndarray  # (w + 1,) of the records, from the first sample on
-    inside: np.ndarray  # (w,) bool: windows that are short and lie within the samples
-    q: Rotation  # w + 1 of them, body to navigation
+    time_s: np.ndarray  # (w + 1,) of the records, since the first sample
+    inside: np.ndarray  # (w,) bool, short windows within the time of the samples
+    q: Rotation  # (w + 1,) attitudes, body to navigation
     v_n: np.ndarray  # (w + 1, 3) m/s, NaN where missing
     sample_s: np.ndarray  # (n,)
     angle: np.ndarray  # (n, 3) rad, integral of the gyros
@@ -39,12 +39,12 @@ class SharedMotion(NamedTuple):
 
     @property
     def length_s(self) -> np.ndarray:
-        """(k,) of the windows inside."""
+        """Durations (k,) [s] of the windows inside."""
         return np.diff(self.time_s)[self.inside]
 
 
 def shared_motion(imu: ImuTable, master: Trajectory) -> SharedMotion | None:
-    """Both on the clock of the IMU; None if there are fewer than ten windows."""
+    """Records and integrals on the clock of the IMU; None with fewer than ten windows."""
     signal = signal_of(imu)
     known = np.flatnonzero(np.isfinite(master.q_nb).all(axis=1))
     known = known[increasing(master.time_ns[known])]
@@ -63,32 +63,32 @@ def shared_motion(imu: ImuTable, master: Trajectory) -> SharedMotion | None:
 
 
 def turned_by_gyros(shared: SharedMotion, lag_s: float = 0.0) -> np.ndarray:
-    """(k, 3) rad: by how much the IMU turned in each window, that much earlier than its stamps."""
+    """Rotation (k, 3) [rad] of the IMU in each window, shifted earlier by `lag_s`."""
     return np.diff(at(shared.time_s - lag_s, shared.sample_s, shared.angle), axis=0)[shared.inside]
 
 
 def turned(q: Rotation, shared: SharedMotion) -> np.ndarray:
-    """(k, 3) rad: by how much attitudes at the records turn in each window."""
+    """Rotation (k, 3) [rad] of attitudes at the records in each window."""
     return (q[:-1].inv() * q[1:]).as_rotvec()[shared.inside]
 
 
 class TurningFit(NamedTuple):
-    """Turning of attitudes against the gyros."""
+    """Fit of the rotation of attitudes to that of the gyros."""
 
-    share: float  # of the turning that is left over
-    late_s: float  # by how much attitudes are older than their stamps
+    share: float  # unexplained share of the rotation
+    late_s: float  # age of attitudes at their stamps
     sigma_s: float
 
 
 def fit_turning(
     q: Rotation, shared: SharedMotion, gyro_map: np.ndarray | None = None
 ) -> TurningFit:
-    """Fit bias, mounting error and delay by Gauss and Newton, from the best of the coarse delays.
+    """Fit bias, mounting error and delay by Gauss-Newton, from the best of coarse delays.
 
     Args:
-        q: attitudes at the records, as they may have been meant.
+        q: attitudes at the records, in the convention to test.
         shared: the motion.
-        gyro_map: (3, 3) that the gyros are multiplied by.
+        gyro_map: (3, 3) applied to the gyros.
     """
     of_master = turned(q, shared)
     C = np.eye(3) if gyro_map is None else gyro_map
@@ -116,7 +116,7 @@ def _pushes(v_n: np.ndarray, shared: SharedMotion) -> tuple[np.ndarray, ...] | N
     """Windows with velocities at both ends; None if there are fewer than ten.
 
     Returns:
-        at: (k,) their numbers.
+        at: (k,) their indices.
         length_s: (k,) s.
         C: (k, 3, 3) from body to navigation axes in their middle.
         gained: (k, 3) m/s along navigation axes, by the master.
@@ -143,10 +143,10 @@ def forces_of(shared: SharedMotion) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def fit_velocity(v_n: np.ndarray, shared: SharedMotion) -> np.ndarray | None:
-    """Fit bias, mounting error and lever arm; the squares (3,) left over along north, east, down.
+    """Fit bias, mounting error and lever arm; residual squares (3,) along north, east, down.
 
     Args:
-        v_n: (w + 1, 3) velocities at the records, as they may have been meant.
+        v_n: (w + 1, 3) velocities at the records, in the convention to test.
         shared: the motion.
 
     Returns:
@@ -166,7 +166,7 @@ def fit_velocity(v_n: np.ndarray, shared: SharedMotion) -> np.ndarray | None:
 
 
 def _least_squares(y: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals, parameters and their standard deviations; what cannot be seen stays zero."""
+    """Residuals, parameters and their standard deviations; unobservable parameters are zero."""
     scale = np.linalg.norm(A, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     A = A / scale

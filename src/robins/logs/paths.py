@@ -1,12 +1,12 @@
-"""Paths in files that are no table of columns: KITTI odometry, Applanix SBET, NovAtel INSPVA.
+"""Trajectories in files without a table of columns: KITTI odometry, Applanix SBET, NovAtel INSPVA.
 
 - KITTI odometry: a line holds the 3 x 4 matrix [R t] of a camera in the axes of the first, x right,
-  y down, z forward (development kit of the benchmark). Times are in ``times.txt`` beside it, or in
+  y down, z forward (development kit of the benchmark). Times are in ``times.txt`` next to it, or in
   ``../sequences/NAME/times.txt``. The first camera's z is taken as north, its x as east.
 - SBET, of POSPac: records of 17 doubles, little-endian: second of the week, latitude, longitude,
   altitude, velocity, roll, pitch, platform heading, wander angle, acceleration, rates. The heading
-  is the platform heading less the wander angle. Velocities are along wander axes whose senses
-  differ by source, and are not read.
+  is the platform heading minus the wander angle. Velocities are in wander axes whose signs differ
+  by source, and are not read.
 - NovAtel INSPVAA and INSPVASA (OEM7 manual, "INSPVA"): week, second, latitude, longitude, height,
   velocity north, east, up, roll (right side down), pitch (nose up), azimuth, status.
 """
@@ -28,7 +28,7 @@ from robins.logs.read_text import NOWHERE
 from robins.logs.text import Head, TextLayout, read_columns
 from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, week_to_ns
 
-_LARGEST = 1 << 30  # bytes of a file
+_LARGEST = 1 << 30  # bytes, largest file
 _KITTI = TextLayout(tuple(f"{row}{k}" for row in "123" for k in range(1, 5)), None, texts=())
 _TO_ENU = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
 _CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # of forward, right, down
@@ -54,7 +54,7 @@ def read_kitti(path: AnyPath, findings: Findings = None) -> Trajectory:
     """Read poses of KITTI odometry.
 
     Raises:
-        LogError: there are no times, or another number of them; a line is no pose.
+        LogError: times are missing or of another number; a line is no pose.
     """
     file, poses = Path(path), read_columns(path, _KITTI, findings)
     beside = (file.parent / "times.txt", file.parents[1] / "sequences" / file.stem / "times.txt")
@@ -81,7 +81,7 @@ def read_kitti(path: AnyPath, findings: Findings = None) -> Trajectory:
 
 
 def is_sbet(head: Head) -> bool:
-    """True if the first two records are a place on Earth, less than 10 s apart."""
+    """True if the first two records have places on Earth and are less than 10 s apart."""
     if len(head.start) < _RECORD + 32:
         return False
     first, then = (np.frombuffer(head.start, _SBET, 4, at) for at in (0, _RECORD))
@@ -96,7 +96,7 @@ def read_sbet(path: AnyPath, findings: Findings = None) -> Trajectory:
     """Read a smoothed best estimate of trajectory.
 
     Raises:
-        LogError: it cannot be read, or holds no whole record of finite numbers.
+        LogError: the file cannot be read, or has no complete record of finite numbers.
     """
     data, _ = read_whole(path, _LARGEST)
     file, count = str(path), len(data) // _RECORD
@@ -124,10 +124,10 @@ def is_inspva(head: Head) -> bool:
 
 
 def read_inspva(path: AnyPath, findings: Findings = None) -> Trajectory:
-    """Read the INSPVA logs among the lines of a file, each against its checksum.
+    """Read the INSPVA logs with valid checksums among the lines of a file.
 
     Raises:
-        LogError: none is whole, or a field of a sound line is no number.
+        LogError: there is none, or a field of one is no number.
     """
     file, rows, numbers, clocks = str(path), list[int](), list[list[float]](), list[list[bytes]]()
     damaged = idle = 0

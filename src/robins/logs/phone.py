@@ -2,16 +2,16 @@
 
 Columns come in any order: ``time`` (``2025-06-11 20:34:27+00:00``), ``latitude longitude`` [deg],
 ``altitude`` [m], ``speed`` [m/s] and ``bearing`` [deg], their accuracies, ``acc_x`` .. [m/s^2],
-``gyro_x`` .. [rad/s], ``mag_x`` .. [uT]. An empty cell is missing; a line is a sample only of what
-it has a number of.
+``gyro_x`` .. [rad/s], ``mag_x`` .. [uT]. An empty cell is missing; a line is a sample only of
+the sensors with numbers in it.
 
-The axes are Android's: x to the right of the screen, y to its upper edge, z out of it towards who
-looks at it. A phone that lies flat, upper edge ahead, is right-forward-up, and that is what the
-tables say; in a holder it stands otherwise, for which give a `Mounting`.
+The axes are Android's: x to the right of the screen, y to its upper edge, z out of the screen. A
+phone that lies flat with its upper edge forward is right-forward-up, as the tables are labelled; in
+a holder it has another orientation, for which give a `Mounting`.
 
-Android states the radius within which the place is with 68 %, so one sigma along north and east is
-that over 1.51. The altitude is taken as above the ellipsoid, as Android gives it; phones of another
-make give it above the sea.
+Android states the radius that contains the position with 68 % probability, so sigma along north and
+east is that over 1.51. The altitude is taken as above the ellipsoid, as in Android; other phones
+give it above sea level.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PLACE = ("latitude", "longitude", "altitude", "horizontalAccuracy", "verticalAc
 _VELOCITY = ("speed", "bearing", "speedAccuracy", "bearingAccuracy")
 _NEEDED = ("time", *_GYRO, *_ACCEL, *_MAG, *_PLACE, *_VELOCITY)
 _RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))  # in sigmas of one axis
-_SINGLE = 5  # RTKLIB's Q of a fix without corrections
+_SINGLE = 5  # Q of RTKLIB for a fix without corrections
 
 
 def _header(head: Head) -> tuple[int, list[str]]:
@@ -50,11 +50,10 @@ def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Raises:
-        LogError: a column is missing or is not numbers, a stamp is no date, or nothing was
-            recorded of one of the sensors.
+        LogError: a column is missing or not numeric, a stamp is no date, or a sensor has no data.
     """
     file, head = str(path), peek(path)
     line, names = _header(head)
@@ -93,7 +92,7 @@ def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
 def fixes_of(
     file: str, time_ns: np.ndarray, place: np.ndarray, velocity: np.ndarray, rows: np.ndarray
 ) -> GnssTable:
-    """Fixes of Android's numbers.
+    """Fixes from the values of Android.
 
     Args:
         file: for messages.
@@ -105,7 +104,7 @@ def fixes_of(
     lat, lon = np.deg2rad(place[:, :2]).T.copy()
     alt_m, radius_m, sigma_alt_m = place[:, 2:].T
     speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
-    # A bearing that is 180 deg unsure says nothing: the error is at most twice the speed.
+    # A bearing of sigma 180 deg is meaningless: the error is at most twice the speed.
     across = speed * np.minimum(np.deg2rad(sigma_bearing_deg), 2.0)
     sigma = np.hypot(sigma_speed, across)
     sigma_v = np.stack([sigma, sigma, np.full(len(speed), np.nan)], axis=-1)

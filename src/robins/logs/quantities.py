@@ -17,15 +17,15 @@ class QuantityGroup(NamedTuple):
 
 
 class TableRecipe(NamedTuple):
-    """The groups of a table."""
+    """Groups of quantities that make a table."""
 
     text: str
-    needs: tuple[tuple[str, ...], ...]  # any of these sets makes it
+    needs: tuple[tuple[str, ...], ...]  # alternative sets of groups that suffice
     more: tuple[str, ...] = ()
 
 
 def _alike(kind: str, names: str, text: str) -> QuantityGroup:
-    """A group whose quantities are of one kind."""
+    """A group of quantities of the same kind of unit."""
     return QuantityGroup(dict.fromkeys(names.split(), kind), text)
 
 
@@ -52,7 +52,7 @@ GROUPS: dict[str, QuantityGroup] = {
     "wheels": _alike("speed", "wheel_speed sigma_wheel_speed", "forward speed by the wheels"),
     "omega": _alike("angle rate", "omega_x omega_y omega_z", "turn rate against inertial space"),
 }
-"""Every group by its name."""
+"""All groups by name."""
 
 TABLES: dict[str, TableRecipe] = {
     "imu": TableRecipe("inertial samples", (("gyro", "accel"), ("dtheta", "dv")), ("dt",)),
@@ -70,13 +70,13 @@ TABLES: dict[str, TableRecipe] = {
     "attitude": TableRecipe("attitude", (("quaternion",), ("euler",))),
     "odometry": TableRecipe("speed of the wheels", (("wheels",),)),
 }
-"""Every table by its kind."""
+"""All tables by kind."""
 
 QUANTITIES: dict[str, str] = {q: kind for g in GROUPS.values() for q, kind in g.kinds.items()}
 """The kind of unit of every quantity."""
 
 CLOCKS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
-"""Units of time stamps, and how many decimals of them a nanosecond is."""
+"""Units of time stamps -> number of decimals of a nanosecond in them."""
 
 DATES = ("iso", "iso UTC", "iso GPS")
 """In place of a unit: ISO 8601 with its offset from UTC, or without one in UTC or GPS time."""
@@ -85,18 +85,18 @@ _GROUP_OF = {q: name for name, g in GROUPS.items() for q in g.kinds}
 
 
 def parts(groups: tuple[str, ...] | str) -> list[str]:
-    """The quantities of groups, or of one."""
+    """Quantities of several groups, or of one."""
     names = (groups,) if isinstance(groups, str) else groups
     return [q for name in names for q in GROUPS[name].kinds]
 
 
 def groups_of(quantities: set[str]) -> set[str]:
-    """The groups of which there is something."""
+    """Groups with at least one of these quantities."""
     return {_GROUP_OF[q] for q in quantities}
 
 
 def tables_of_groups(groups: set[str]) -> tuple[str, ...]:
-    """Which tables columns of these groups make: a place with an attitude is a path."""
+    """Kinds of the tables that these groups make: a place with an attitude is a path."""
     placed, turned = groups & {"place", "local"}, groups & {"euler", "quaternion"}
     has = {
         "imu": groups & {"gyro", "accel", "dtheta", "dv"},
@@ -110,5 +110,5 @@ def tables_of_groups(groups: set[str]) -> tuple[str, ...]:
 
 
 def words_of(kind: str) -> str:
-    """A table in words."""
+    """Name of a kind of table in words."""
     return TABLES[kind].text

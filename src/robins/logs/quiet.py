@@ -1,4 +1,4 @@
-"""Material of the doctor: a table without its bad rows, its usual step, its quiet stretches."""
+"""Tools of the doctor: tables without bad rows, their usual step, their quiet stretches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _STEADY = 0.003  # relative change of the specific force from one window at rest
 def name_of(table: Table) -> str:
     """Name of a table in sentences: its file without the folder, or its type.
 
-    A magnetometer comes out of the file of its IMU, so the part of the file is said too.
+    A magnetometer is often in the file of its IMU, so the part of the file is named too.
     """
     if not table.source:
         return type(table).__name__
@@ -46,7 +46,7 @@ def place(table: Table, row: int) -> str:
 def finding(
     severity: Severity, table: Table, code: str, value: Value, row: int | None = None
 ) -> Callable[[str], Finding]:
-    """As `make_finding`, about a table or a row of it."""
+    """Maker of a finding about a table or a row of it, see `make_finding`."""
     where = "" if row is None else place(table, row)
     return make_finding(severity, code, table.source, where, value, name_of(table))
 
@@ -55,7 +55,7 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def usual_step_s(time_ns: np.ndarray) -> float:
-    """Median step of time among those that go forward [s]; NaN if there is none."""
+    """Median of the positive steps of time [s]; NaN if there is none."""
     step = np.diff(time_ns)
     step = step[step > 0]
     return float(np.median(step)) * 1e-9 if len(step) else np.nan
@@ -81,15 +81,15 @@ class ImuSignal(NamedTuple):
     """An IMU table as rates, good rows only, in the order of time."""
 
     rows: np.ndarray  # (n,) index into the table
-    time_s: np.ndarray  # (n,) since the first of them
-    gyro: np.ndarray  # (n, 3) rad/s if the units are what the table claims
+    time_s: np.ndarray  # (n,) since the first sample
+    gyro: np.ndarray  # (n, 3) rad/s if the units are as labelled
     accel: np.ndarray  # (n, 3) m/s^2, likewise
-    step_s: float  # mean step, gaps left out
+    step_s: float  # mean step without gaps
 
 
 def signal_of(imu: ImuTable) -> ImuSignal | None:
     """The usable samples of a table; None if there are fewer than ten."""
-    # Wide enough for deg/h and milli-g, so that a wrong unit is seen, and squares do not overflow.
+    # Wide enough for deg/h and milli-g, so that wrong units are detected; squares do not overflow.
     good = (np.abs(np.hstack([imu.gyro, imu.accel])) < _NONSENSE).all(axis=1)
     rows = np.flatnonzero(good)
     rows = rows[increasing(imu.time_ns[rows])]
@@ -111,21 +111,21 @@ class Windows(NamedTuple):
     gyro: np.ndarray  # (w, 3) mean
     accel: np.ndarray  # (w, 3) mean
     restless: np.ndarray  # (w,) scatter of |gyro - mean|
-    at_rest: np.ndarray  # (w,) bool: the specific force hardly changes; needs no unit
-    calm: np.ndarray  # (w,) bool: those at rest; if there are none, the quietest tenth
+    at_rest: np.ndarray  # (w,) bool, the specific force hardly changes, in any unit
+    calm: np.ndarray  # (w,) bool, those at rest, or, if there are none, the quietest tenth
 
 
 def usual_force(windows: Windows) -> float:
-    """Median size of the specific force when it is calm."""
+    """Median magnitude of the specific force in calm windows."""
     return float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
 
 
 def _long_enough(low: np.ndarray, change: np.ndarray, least: int) -> np.ndarray:
-    """(w,) bool: windows of low scatter in a row of at least so many without a change."""
+    """Mask (w,) of windows of low scatter in runs of at least `least` without a change."""
     if len(low) < least:
         return np.zeros_like(low)
     joined = np.where(change & low[1:] & low[:-1], 1, 0)
-    row = sliding_window_view(joined, least - 1).all(axis=1)  # begins at each window
+    row = sliding_window_view(joined, least - 1).all(axis=1)  # for runs that begin at each window
     return np.convolve(row, np.ones(least)) > 0
 
 
@@ -140,8 +140,8 @@ def windows_of(signal: ImuSignal) -> Windows:
     gyro, accel = cut(signal.gyro), cut(signal.accel)
     force, size = accel.mean(axis=1), np.linalg.norm(accel, axis=-1)
     mean = size.mean(axis=1)
-    # A smooth drive scatters as little as rest does, but its force changes with every turn, if not
-    # within a second or two.
+    # A smooth drive scatters as little as rest, but its specific force changes with every turn, if
+    # not within a second or two.
     change = np.linalg.norm(np.diff(force, axis=0), axis=-1) < _STEADY * mean[1:]
     scatter = size.std(axis=1)
     low = scatter < _REST * mean

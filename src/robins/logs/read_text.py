@@ -1,4 +1,4 @@
-"""Reading a text log of any format: the columns of its row become tables in SI units."""
+"""Reading of text logs of any format: columns become tables in SI units."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from robins.units import from_si, to_si, unit
 
 NOWHERE = Origin(0.0, 0.0, 0.0)
 _TEXTS = ("time", "time_of_week", "week")
-# Beyond these an angle is in another unit or another column; a heading may be unwrapped a little.
+# A larger angle is in another unit or column; a heading may be unwrapped a little.
 _LIMIT_DEG = {"lat": 90.0, "lon": 400.0, "roll": 400.0, "pitch": 90.0, "heading": 400.0}
 _NUMBER = r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?)"
 _ORIGIN = re.compile(rf"\borigin: {_NUMBER} deg,? {_NUMBER} deg,? {_NUMBER} m\b")
@@ -75,7 +75,7 @@ class TextContents(NamedTuple):
         return parts(group)[0] in self.values
 
     def stack(self, group: str) -> np.ndarray:
-        """Its columns side by side; NaN if there are none."""
+        """Columns of a group, stacked; NaN if there are none."""
         missing = np.full(len(self.rows), np.nan)
         return np.stack([self.values.get(q, missing) for q in parts(group)], axis=-1)
 
@@ -96,17 +96,16 @@ def read_text(
     """Read a log of this format.
 
     Args:
-        format: what its columns hold.
-        path: the file, plain or compressed; an archive of arrays likewise.
-        findings: receives what was left out or is doubted; without it that is issued as
-            `LogWarning`.
-        origin: where local metres are put on the Earth, by default where a comment says.
+        format: of the columns.
+        path: the file or archive of arrays, plain or compressed.
+        findings: receives omissions and doubts; without it they are issued as `LogWarning`.
+        origin: position on the Earth of local metres; by default that in a comment.
 
     Returns:
-        The one table that it makes, or a dataset of several.
+        The table of the file, or a dataset of several.
 
     Raises:
-        LogError: columns are missing, named twice, of another unit, or not numbers.
+        LogError: columns are missing, named twice, in another unit, or not numeric.
     """
     file, head = str(path), head_of(path)
     header = header_of(format, head)
@@ -148,7 +147,7 @@ def read_text(
 
 
 def _marks(file: str, header: ColumnHeader, columns: dict[str, FoundColumn]) -> dict[str, int]:
-    """Places of the columns whose text tells which rows hold a quantity.
+    """Indices of the columns whose text selects the rows of a quantity.
 
     Raises:
         LogError: the header has no such column.
@@ -210,10 +209,10 @@ def _times(
 
 
 def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
-    """Frames of the format, or those that a comment above the rows states.
+    """Frames of the format, or those stated by a comment above the rows.
 
     Raises:
-        LogError: it says something else than NED FRD or ENU RFU.
+        LogError: a comment states others than NED FRD or ENU RFU.
     """
     nav: NavFrame = "ENU" if format.nav == "ENU" else "NED"
     body: BodyFrame = "RFU" if format.body == "RFU" else "FRD"
@@ -329,7 +328,7 @@ _MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude, "odom
 
 
 def _quaternions(read: TextContents) -> np.ndarray:
-    """As recorded, or from roll, pitch and heading, the same in both pairs of frames."""
+    """Quaternions as recorded, or from roll, pitch and heading, equal in both pairs of frames."""
     if read.has("quaternion"):
         first, *_, last = (read.columns[q].name for q in parts("quaternion"))
         name, q = f"{first} .. {last}", read.stack("quaternion")
@@ -339,7 +338,7 @@ def _quaternions(read: TextContents) -> np.ndarray:
 
 
 def _within_limits(read: TextContents, quantity: str) -> None:
-    """Take out angles that cannot be; refuse the column if they are many.
+    """Remove impossible angles; refuse the column if they are many.
 
     Raises:
         LogError: more than half of the angles are beyond the limit.
@@ -367,7 +366,7 @@ def _within_limits(read: TextContents, quantity: str) -> None:
 
 
 def _compare_dt(read: TextContents) -> None:
-    """An increment is taken to be over the time since the row before: say where dt disagrees."""
+    """Report if dt differs from the time since the previous row, the duration of an increment."""
     dt, elapsed = read.values["dt"], np.diff(read.time_ns) * 1e-9
     off = np.flatnonzero(np.abs(dt[1:] - elapsed) > 0.01 * np.abs(dt[1:]))
     if len(off):

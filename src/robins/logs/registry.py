@@ -1,7 +1,7 @@
-"""The formats of logs, recognised by content: `open_log` reads them, `write_log` writes some.
+"""Formats of logs, recognised by content: `open_log` reads them, `write_log` writes some.
 
-Text is described by the rows of `robins.logs.text_formats`; what is no table of numbers has a
-reader of its own and a row here, and perhaps a writer.
+Tables of numbers in text are described by the rows of `robins.logs.text_formats`; other formats
+have a reader of their own and a row here, and perhaps a writer.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from robins.logs.write_text import write_text
 
 
 class Format(NamedTuple):
-    """One kind of file."""
+    """A format of files."""
 
     name: str
     holds: tuple[str, ...]  # kinds of tables; several make a `Dataset`
@@ -51,8 +51,8 @@ class Format(NamedTuple):
     recognise: Callable[[Head], bool]
     read: Callable[..., Table | Dataset]
     binary: bool = False
-    text: TextFormat | None = None  # its row, by which it is also written
-    write: Callable[[AnyPath, Table | Dataset], None] | None = None  # no text
+    text: TextFormat | None = None  # its description, by which it is also written
+    write: Callable[[AnyPath, Table | Dataset], None] | None = None  # not for text
 
 
 def _of_text(row: TextFormat) -> Format:
@@ -60,7 +60,7 @@ def _of_text(row: TextFormat) -> Format:
 
 
 def _own(name: str, holds: str, *functions: Callable, binary: bool = True):
-    """A row of a format that text rows do not describe, and then a line for people.
+    """Row of a format with a reader of its own, completed by a line for people.
 
     Its functions recognise it, read it and, if there are three, write it.
     """
@@ -124,14 +124,14 @@ FORMATS: tuple[Format, ...] = (
         "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'"
     ),
 )
-"""All of them."""
+"""All formats."""
 
 
 def _of_names(path: AnyPath) -> Callable[..., Table | Dataset]:
-    """Reader of the one text format whose names the arrays of an archive have.
+    """Reader of the text format whose column names match the arrays of an archive.
 
     Raises:
-        LogError: there is none, or several; the sentence lists the names of the arrays.
+        LogError: none matches, or several do; the message lists the names of the arrays.
     """
     head = head_of(path)
     rows = [row for row in TEXT_FORMATS if row.named and row.recognise(head)]
@@ -193,18 +193,18 @@ def open_log(
 
     Args:
         path: the file, plain or compressed (.xz, .gz); or a folder that is a recording.
-        format: a name in `FORMATS`, or a row of your own; by default it is recognised by content.
-            Of a folder only a format of ROS can be given.
-        findings: receives what the reader left out or doubts; without it that is issued as
+        format: a name in `FORMATS`, or a format of your own; by default recognised by content. For
+            a folder only a ROS format can be given.
+        findings: receives omissions and doubts of the reader; without it they are issued as
             `LogWarning`.
-        origin: where a path in local metres is put on the Earth.
+        origin: position on the Earth of a path in local metres.
 
     Returns:
-        An `ImuTable` along the axes of the sensor, a `GnssTable` or a `Trajectory`; a `Dataset` if
+        An `ImuTable` in the axes of the sensor, a `GnssTable` or a `Trajectory`; a `Dataset` if
         the file holds several tables.
 
     Raises:
-        LogError: unknown format, unreadable file, a line or number that is not what it should be.
+        LogError: unknown format, unreadable file, an invalid line or number.
     """
     if isinstance(format, TextFormat):
         known = _of_text(format)
@@ -231,23 +231,23 @@ def write_log(
     week: int | None = None,
     origin: Origin | None = None,
 ) -> None:
-    """Write a table so that it is read back as it was: every number, but for conversions.
+    """Write a table so that it is read back unchanged, except for unit conversions.
 
     Args:
         path: the file; compressed if its name ends in .xz or .gz.
-        table: what the format holds; several tables as a dataset.
-        format: a name in `FORMATS`, or a row of your own; by default ``named-imu`` for inertial
+        table: of a kind that the format holds; several as a dataset.
+        format: a name in `FORMATS`, or a format of your own; by default ``named-imu`` for inertial
             samples and ``named-path`` for a path, both text, and ``ros-mcap`` if the name ends in
             .mcap.
-        week: where time is that of a GPS week: the week whose beginning absolute stamps are counted
-            from, by default that of the first (give the same for the files of one run), and that
-            which other stamps are of.
-        origin: where places are metres: the point they are from, by default the first.
+        week: for formats with time of a GPS week: the week that absolute stamps are relative to, by
+            default that of the first (use the same for all files of a run), and the week of other
+            stamps.
+        origin: for formats in local metres: their origin, by default the first point.
 
     Raises:
-        TypeError: it is no dataset or table.
-        LogError: the format holds something else, or the file cannot be written; no part of it is
-            left behind.
+        TypeError: the argument is no dataset or table.
+        LogError: the format holds other data, or the file cannot be written; no part of it is left
+            behind.
     """
     require_kind(table, (Dataset, *KINDS), "write_log")
     if isinstance(format, TextFormat):
@@ -278,10 +278,10 @@ def _usual(path: AnyPath, table: Table | Dataset) -> str:
 
 
 def format_named(name: str, path: AnyPath, among: Sequence[Format] = FORMATS) -> Format:
-    """Format of this name; the path is for the message.
+    """Format by name; the path is for the message.
 
     Raises:
-        LogError: there is none.
+        LogError: there is no such format.
     """
     named = {f.name: f for f in among}
     if name not in named:

@@ -1,8 +1,8 @@
-"""Messages out of the files in which ROS records: .mcap and .db3 of ROS 2, .bag of ROS 1.
+"""Messages from ROS recordings: .mcap and .db3 of ROS 2, .bag of ROS 1.
 
-Files are mapped, not loaded, so that they may be of any size; compressed ones are unpacked, up to 1
-GiB. Of an MCAP file that breaks off all whole records are read. The others end with their index, so
-one that breaks off is refused, with the command that repairs it.
+Files are mapped, not loaded, so that they may be of any size; compressed ones are decompressed, up
+to 1 GiB. All complete records of a truncated MCAP file are read. The others end with their index,
+so a truncated one is refused, with the command that repairs it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ mcap_package = partial(extra_package, what="an MCAP file", package=_FOR_THESE)
 
 
 Raw: TypeAlias = tuple[str, str, bytes, bool]
-"""Type of a message as ROS 2 spells it, topic, bytes, and whether ROS 1 serialised it."""
+"""Type of a message as named in ROS 2, topic, bytes, and True if serialised by ROS 1."""
 
 
 def raw_messages(path: Path, wanted: Collection[str], findings: Findings) -> Iterator[Raw]:
@@ -50,11 +50,11 @@ def raw_messages(path: Path, wanted: Collection[str], findings: Findings) -> Ite
 
     Args:
         path: a file, plain or compressed.
-        wanted: names of types, as ROS 2 spells them.
-        findings: receives what was left out.
+        wanted: names of types, as in ROS 2.
+        findings: receives omissions.
 
     Raises:
-        LogError: a package is not installed; the file is damaged or of no kind that ROS records.
+        LogError: a package is not installed; the file is damaged or no ROS recording.
     """
     data = map_file(path, findings)
     read = {MCAP: _from_mcap, SQLITE: _from_db3, BAG: _from_bag}
@@ -68,7 +68,7 @@ def raw_messages(path: Path, wanted: Collection[str], findings: Findings) -> Ite
 
 
 def _plain(data: bytes, refuse: Callable[[str], LogError]) -> bytes:
-    """A message of ROS 2, which may be packed by itself."""
+    """A ROS 2 message, decompressed if it was compressed by itself."""
     if not data.startswith(_ZSTD):
         return data
     import zstandard
@@ -93,7 +93,7 @@ def _from_mcap(
     channels: dict[int, tuple[str, str]] = {}  # type and topic
     one: Any
     for one in _records(file, data, sound, refuse):
-        record = type(one).__name__  # the package is not imported here
+        record = type(one).__name__  # by name, as the package is not imported here
         if record == "Schema":
             schemas[one.id] = one.name
         elif record == "Channel":
@@ -114,7 +114,7 @@ def _from_mcap(
 
 
 def _sound(data: Bytes) -> tuple[int, bool]:
-    """Up to which byte records follow each other without a break, and whether the last closes."""
+    """End of the unbroken sequence of records, and True if the last one closes the file."""
     at = len(MCAP)
     while at + _RECORD.size <= len(data):
         opcode, size = _RECORD.unpack_from(data, at)
@@ -129,7 +129,7 @@ def _sound(data: Bytes) -> tuple[int, bool]:
 def _records(
     file: str, data: Bytes, sound: int, refuse: Callable[[str], LogError]
 ) -> Iterator[McapRecord]:
-    """All records of a file, those of its chunks among them; the package decodes each.
+    """All records of a file, including those in chunks, decoded by the package.
 
     Raises:
         LogError: the package is not installed, or a record is damaged.
@@ -140,7 +140,7 @@ def _records(
         from mcap.stream_reader import StreamReader, breakup_chunk
     plain = at = 0
 
-    def read(size: int) -> bytes:  # no byte behind the last whole record
+    def read(size: int) -> bytes:  # no byte after the last complete record
         nonlocal at
         part = data[at : min(at + size, sound)]
         at += len(part)
@@ -154,7 +154,7 @@ def _records(
                 one = next(records, None)
         except LogError as error:
             if isinstance(error.__cause__, EndOfFile) and at >= min(sound, len(data)):
-                return  # behind the last whole record: the file is not closed
+                return  # after the last complete record: the file is not closed
             raise
         if one is None:
             return
@@ -212,7 +212,7 @@ def _from_db3(
 
 
 def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sqlite3.Connection:
-    """The database, which cannot be changed, and nothing of whose schema is trusted."""
+    """Open the database read-only, without trust in its schema."""
     with decoding(refuse):
         if isinstance(data, bytes):
             base = sqlite3.connect(":memory:")
@@ -239,7 +239,7 @@ def _from_bag(
         fix = "fetch it again, or restore its index: rosbag reindex FILE"
         return LogError(file, f"is damaged or was not closed ({why})", fix)
 
-    # the reader takes whatever opens: a map gives no more bytes than there are
+    # the reader accepts any stream: a map gives no more bytes than there are
     stream = io.BytesIO(data) if isinstance(data, bytes) else data
     place = SimpleNamespace(exists=lambda: True, open=lambda mode: stream)
     with decoding(refuse), Reader(cast("RPath", place)) as reader:
@@ -252,7 +252,7 @@ def _from_bag(
 
 
 def _bounded(packed: bytes) -> bytes:
-    """Content of a chunk, as far as measurements unpack."""
+    """Decompressed content of a chunk, of bounded size."""
     from lz4.frame import LZ4FrameDecompressor
 
     kinds = {b"BZ": bz2.BZ2Decompressor, b"\x04\x22": LZ4FrameDecompressor}

@@ -1,17 +1,17 @@
 """Recordings of ROS 1 and 2: the messages of `robins.ros` and velocities of receivers, as tables.
 
-Of each type the first topic that has messages counts:
+The first topic with messages of each type is read:
 
-- ``sensor_msgs/Imu``: rates [rad/s] and specific force [m/s^2]; where one topic has only rates and
-  another only specific forces, both. The orientation is an estimate, no truth, and is left alone.
+- ``sensor_msgs/Imu``: rates [rad/s] and specific force [m/s^2]; if one topic has only rates and
+  another only specific forces, both. The orientation is an estimate, not truth, and is ignored.
 - ``sensor_msgs/MagneticField``: magnetic field [T].
-- ``sensor_msgs/NavSatFix``: fixes; sigmas are missing where the covariance is not known.
+- ``sensor_msgs/NavSatFix``: fixes; sigmas are missing if the covariance is unknown.
 - ``geometry_msgs/TwistStamped``, ``TwistWithCovarianceStamped``: east-north-up velocity of a fix of
-  the same frame_id and stamp, as drivers of receivers write it; any other is left alone.
+  the same frame_id and stamp, as written by receiver drivers; any other is ignored.
 
-Axes of sensors are forward-left-up (REP-103) and become those of a table. The stamp is that of the
-header: UTC since 1970, which becomes GPS time, or else a count from a start of its own, which stays
-(a second of UTC that is a leap second has no stamp of its own).
+Axes of sensors are forward-left-up (REP-103) and are converted to those of a table. The stamp is
+that of the header: UTC since 1970, converted to GPS time, or a count from another start, unchanged
+(a leap second of UTC has no stamp of its own).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _ENU = np.array([1.0, 1.0, -1.0])  # signs of a velocity in the order of `_NED`
 _QUALITY = {0: 5, 1: 3, 2: 4}  # status of a NavSatFix -> RTKLIB's Q
 _IMU, _MAG, _FIX = (ros.name_of(kind) for kind in (ros.Imu, ros.MagneticField, ros.NavSatFix))
 _TWISTS = tuple(f"geometry_msgs/msg/Twist{kind}Stamped" for kind in ("", "WithCovariance"))
-# where a quantity lies among the numbers of its message
+# positions of quantities among the numbers of a message
 _TURN, _TURN_KNOWN, _FORCE, _FORCE_KNOWN = slice(13, 16), 16, slice(25, 28), 28
 _STATUS, _PLACE, _VARIANCE, _KIND = 0, slice(2, 5), [5, 9, 13], 14
 _TWIST_VARIANCE = [6, 13, 20]
@@ -48,7 +48,7 @@ class _TopicMessages(NamedTuple):
     """The messages of a topic."""
 
     topic: str
-    frame_id: str  # of the first
+    frame_id: str  # of the first message
     time_ns: np.ndarray
     values: np.ndarray  # (n, numbers of a message)
 
@@ -62,14 +62,14 @@ def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
 
     Args:
         path: a file (.mcap, .db3, .bag), plain or compressed, or the folder of a recording.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Returns:
-        A dataset; a table where there are no inertial samples but magnetic field or fixes.
+        A dataset; a table if there are no inertial samples but magnetic field or fixes.
 
     Raises:
         LogError: a package of the extra `logs` is not installed; a file is damaged or missing, or
-            holds no samples.
+            has no samples.
     """
     file = str(path)
     topics, kinds = _topics(path, findings)
@@ -88,7 +88,7 @@ def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
 
 
 def _topics(path: AnyPath, findings: Findings) -> tuple[Topics, set[str]]:
-    """All messages that are read, by type and topic, and the types of all that are there.
+    """All messages that are read, by type and topic, and all types in the recording.
 
     Raises:
         LogError: as `read_rosbag`.
@@ -124,7 +124,7 @@ def _topics(path: AnyPath, findings: Findings) -> tuple[Topics, set[str]]:
 def _first(
     file: str, topics: Topics, name: str, findings: Findings, beside: str = ""
 ) -> _TopicMessages | None:
-    """The first topic of a type, and a note of the others but that `beside` it."""
+    """First topic of a type; a note lists the others, except `beside`."""
     found = [one for (of, _), one in topics.items() if of == name]
     left = [one.topic for one in found[1:] if one.topic != beside]
     if left:
@@ -136,10 +136,10 @@ def _first(
 
 
 def _inertial(file: str, topics: Topics, findings: Findings) -> ImuTable | None:
-    """Samples of the first topic, with those of another where it has one half of them only."""
+    """Samples of the first topic, merged with another if it has only rates or specific forces."""
 
     def known(one: _TopicMessages, place: slice, at: int) -> np.ndarray:
-        """A quantity, forward-right-down; NaN where its covariance states that it is not known."""
+        """A quantity, forward-right-down; NaN if its covariance marks it as unknown."""
         return np.where(one.values[:, at : at + 1] == -1.0, np.nan, one.values[:, place] * _FLU)
 
     tables = [
@@ -161,7 +161,7 @@ def _fixes(file: str, gnss: _TopicMessages, topics: Topics, findings: Findings) 
     lost = status < 0
     variance = gnss.values[:, _VARIANCE][:, _NED]
     unknown = gnss.values[:, _KIND] == 0
-    with np.errstate(invalid="ignore"):  # a negative variance is none
+    with np.errstate(invalid="ignore"):  # a negative variance means unknown
         sigma_m = np.where(unknown[:, None], np.nan, np.sqrt(variance))
     place = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
     lat, lon, alt = np.deg2rad(place[0]), np.deg2rad(place[1]), place[2]
@@ -174,7 +174,7 @@ def _fixes(file: str, gnss: _TopicMessages, topics: Topics, findings: Findings) 
 def _velocities(
     file: str, gnss: _TopicMessages, topics: Topics, findings: Findings
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
+    """Velocities of the fixes and their sigmas, if written by the receiver's driver."""
     for (name, topic), one in topics.items():
         if name not in _TWISTS or one.frame_id != gnss.frame_id:
             continue

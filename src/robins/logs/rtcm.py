@@ -1,4 +1,4 @@
-"""Corrections of RTCM 3 in a stream: bytes in which a sync word of another protocol is none.
+"""RTCM 3 corrections in a stream, whose bytes may look like sync words of another protocol.
 
 Source: RTCM 10403.3, section 4: 0xD3, six bits of zero, ten bits of length, content, CRC-24Q.
 """
@@ -10,7 +10,7 @@ from robins.logs.opening import Bytes
 PREAMBLE = b"\xd3"
 _LONGEST, _AROUND = 1023, 6  # bytes of the content; of head and checksum
 _POLYNOMIAL = 0x1864CFB
-_TRIED = 64  # bytes before that look like a preamble; a damaged file may be full of them
+_TRIED = 64  # most possible preambles tried; a damaged file may be full of them
 
 
 def _of_byte(byte: int) -> int:
@@ -25,7 +25,7 @@ _REMAINDERS = [_of_byte(byte) for byte in range(256)]
 
 
 def end_of_frame(data: Bytes, at: int) -> int:
-    """End of the correction with a right checksum in which a byte lies; 0 where it lies in none."""
+    """End of the valid correction that contains the byte `at`; 0 if there is none."""
     first, begin = max(at - _LONGEST - _AROUND, 0), at
     for _ in range(_TRIED):
         begin = data.rfind(PREAMBLE, first, begin)
@@ -39,7 +39,7 @@ def end_of_frame(data: Bytes, at: int) -> int:
 
 
 def crc24q(content: bytes) -> int:
-    """Cyclic redundancy check of Qualcomm; 0 of a frame with its right checksum behind."""
+    """Cyclic redundancy check of Qualcomm; 0 for a frame that ends with its valid checksum."""
     crc = 0
     for byte in content:
         crc = (crc << 8 & 0xFFFFFF) ^ _REMAINDERS[crc >> 16 ^ byte]

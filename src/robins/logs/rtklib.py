@@ -1,6 +1,6 @@
 """RTKLIB solutions (.pos): positions and velocities of a GNSS antenna.
 
-The header names the columns and the time system; both are believed, not assumed. RTKLIB's third
+The header states the columns and the time system; both are used. RTKLIB's third
 axis is up: ``vu`` becomes ``v_D = -vu`` and ``sdu`` the sigma along D. Correlations (sdne, ...) are
 not kept.
 """
@@ -23,7 +23,7 @@ from robins.logs.findings import (
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
-# What RTKLIB writes, with velocities or without; used where the header was stripped.
+# Columns of RTKLIB, with velocities or without; used if the header was stripped.
 _POSITION: list[str] = ["latitude", "longitude", "height", "Q", "ns"]
 _POSITION += ["sdn", "sde", "sdu", "sdne", "sdeu", "sdun", "age", "ratio"]
 _VELOCITY = ("vn", "ve", "vu", "sdvn", "sdve", "sdvu")
@@ -51,7 +51,7 @@ def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Raises:
         LogError: the file is not such a solution, or in one of RTKLIB's other forms.
@@ -107,7 +107,7 @@ def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
 
 
 def _header(head: Head) -> tuple[list[str], bool]:
-    """Names of the number columns, if the header gives them, and whether times are UTC."""
+    """Names of the number columns, if the header gives them, and True if times are UTC."""
     for number, line in enumerate(head.lines, start=1):
         if line.startswith("%"):
             fields = line[1:].replace(",", " ").split()

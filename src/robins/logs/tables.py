@@ -1,7 +1,7 @@
-"""The tables that readers hand on: their kinds, and their arrays as others may rely on them.
+"""Tables returned by readers: their kinds, and guaranteed properties of their arrays.
 
-Arrays are float64 and int64, contiguous, of matching lengths. Quaternions are of unit length,
-missing whole, or not believed.
+Arrays are float64 and int64, contiguous, of matching lengths. Quaternions are of unit length or
+NaN.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ KINDS: dict[type, str] = {
     AttitudeTable: "attitude",
     OdometryTable: "odometry",
 }
-"""The field of a `Dataset` in which a table lies; a path that is no truth is its ``master``."""
+"""Field of a `Dataset` for each type of table; a path that is no truth is its ``master``."""
 
 
 def place_of(table: GnssTable | Trajectory) -> np.ndarray:
-    """(n, 3) latitude, longitude, height."""
+    """Latitude, longitude [rad], height [m], (n, 3)."""
     return np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1)
 
 
 def kind_of(table: Table) -> str:
-    """The field of a `Dataset` for a table of this type."""
+    """Field of a `Dataset` for a table of this type."""
     return KINDS[type(table)]
 
 
 def kind_in_text(table: Table) -> str:
-    """The kind of a table among those of `robins.logs.quantities`: a path is a trajectory."""
+    """Kind of a table as in `robins.logs.quantities`, where a path is a trajectory."""
     kind = kind_of(table)
     return "trajectory" if kind == "truth" else kind
 
 
 def tables_of(opened: Table | Dataset) -> list[Table]:
-    """Tables that a reader returned; of a dataset all but the master's."""
+    """Tables returned by a reader; for a dataset, all but the master's."""
     if not isinstance(opened, Dataset):
         return [opened]
     tables = [getattr(opened, kind) for kind in KINDS.values()]
@@ -64,18 +64,18 @@ def tables_of(opened: Table | Dataset) -> list[Table]:
 def recording(
     file: str, imu: ImuTable, gnss: GnssTable | None = None, mag: MagTable | None = None
 ) -> Dataset:
-    """Dataset of a file that states the unit of its stamps, called by the name of the file."""
+    """Dataset of a file that states the unit of its stamps, named after the file."""
     return Dataset(stem_of(file), imu, gnss, mag=mag, time_unit_known=(file,))
 
 
 def stem_of(file: str) -> str:
-    """Name of a file without its folder and whatever follows the first dot."""
+    """Name of a file without its folder and without extensions, from the first dot on."""
     return Path(file).name.split(".")[0]
 
 
 AnyTable = TypeVar("AnyTable", bound=Table)
 
-# Columns of real numbers and how many components each has; 0: one number a row.
+# Columns of real numbers and their numbers of components; 0: one number per row.
 _PLACE = {"lat_rad": 0, "lon_rad": 0, "alt_m": 0}
 _FLOATS: dict[type, dict[str, int]] = {
     ImuTable: {"gyro": 3, "accel": 3},
@@ -89,7 +89,7 @@ _OPTIONAL = {(GnssTable, "v_n"), (GnssTable, "sigma_v"), (Trajectory, "omega_ib_
 
 
 def checked(table: AnyTable) -> AnyTable:
-    """The same table with plain arrays.
+    """Table with plain arrays.
 
     Integers, float32, big-endian and strided arrays become contiguous float64 of the same values.
 
@@ -162,20 +162,20 @@ def _shaped(table: Table, field: str, array: np.ndarray, shape: tuple[int, ...])
     return array
 
 
-TOLERANCE = 1e-3  # how far from one a length may be by its decimals
+TOLERANCE = 1e-3  # largest deviation of a length from one, by rounding of decimals
 
 
 def unit_quaternions(
     file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: Findings
 ) -> np.ndarray:
-    """Unit quaternions; a row that is not one is taken as missing, whole, and reported.
+    """Unit quaternions; other rows become NaN and are reported.
 
     Args:
         file: for messages.
         name: of the columns, for messages.
         q: (n, 4) as recorded; a row with a NaN is missing.
-        rows: (n,) line numbers, or None where there are no lines.
-        findings: receives what is not believed; without it that is issued as `LogWarning`.
+        rows: (n,) line numbers, or None if there are no lines.
+        findings: receives rejected rows; without it they are issued as `LogWarning`.
 
     Raises:
         LogError: more than half of the rows are not of unit length.

@@ -1,10 +1,10 @@
-"""Columns of numbers out of a text log: fast, strict, in bounded memory.
+"""Columns of numbers from a text log: fast, strict, in bounded memory.
 
-Blocks of whole lines go through NumPy's C reader, which takes a number exactly or not at all. What
-it refuses is read again line by line, to allow comments and empty fields or to name line, field
-and value. A number is never completed, shortened or guessed:
+Blocks of complete lines are read by NumPy's C reader, which reads a number exactly or not at all.
+Refused blocks are read again line by line, to allow comments and empty fields or to name line,
+field and value. A number is never completed, shortened or guessed:
 
-- a last line without its line end may have lost digits, so it is left out and reported;
+- a last line without its line end may have lost digits, so it is omitted and reported;
 - a first line shorter than the next (a recording that began mid-line) likewise;
 - an empty field, ``nan`` and ``inf`` are kept as NaN and infinities, for `clean` to count;
 - anything else that is not a number is a `LogError`.
@@ -36,21 +36,21 @@ COMMENTS = ("#", "%")
 class TextLayout(NamedTuple):
     """Layout of the lines of a file.
 
-    Columns at the places `texts`, at least one, are kept as text (time stamps are read from their
-    digits), those at the places `numbers` are numbers, others may hold anything. Further columns
-    than those named may follow; all lines must have as many as the first ones have.
+    Columns at the indices `texts`, at least one, are kept as text (time stamps are read from their
+    digits), those at `numbers` are numbers, others may hold anything. More columns than those named
+    may follow; all lines must have as many as the first ones.
     """
 
     names: tuple[str, ...]
     delimiter: str | None  # None: blanks
     texts: tuple[int, ...] = (0,)
-    numbers: tuple[int, ...] | None = None  # in ascending order; None: all that are not text
+    numbers: tuple[int, ...] | None = None  # ascending; None: all that are not text
     skip: int = 0  # header lines
-    all_named: bool = False  # no columns follow those named: more fields are decimal commas
+    all_named: bool = False  # no further columns: additional fields are decimal commas
     decimal: str = "."
 
     def number(self, place: int) -> int:
-        """Index into `Columns.values` of the column at this place."""
+        """Index into `Columns.values` of the column with this index in the file."""
         if self.numbers is not None:
             return self.numbers.index(place)
         return place - sum(text < place for text in self.texts)
@@ -65,13 +65,13 @@ class Columns(NamedTuple):
 
 
 class Head(NamedTuple):
-    """The first whole lines of a file, to recognise its format by; a binary one has none."""
+    """First complete lines of a file, to recognise its format; none for a binary one."""
 
     file: str
     lines: list[str]
     start: bytes = b""  # the first bytes of a binary file
-    names: tuple[str, ...] = ()  # of the columns of an archive
-    arrays: tuple[np.ndarray, ...] = ()  # they themselves
+    names: tuple[str, ...] = ()  # of the columns, for an archive
+    arrays: tuple[np.ndarray, ...] = ()  # the columns of an archive
 
     def data(self, count: int = 50) -> list[tuple[int, str]]:
         """Line numbers and text of the first lines that are neither blank nor comments."""
@@ -81,7 +81,7 @@ class Head(NamedTuple):
 
 
 def peek(path: AnyPath) -> Head:
-    """The first lines of a file, at most 64 KiB of it.
+    """Read the first lines of a file, at most 64 KiB.
 
     Raises:
         LogError: the file is empty, cannot be opened, or is not text.
@@ -114,7 +114,7 @@ def read_columns(path: AnyPath, layout: TextLayout, findings: Findings = None) -
     Args:
         path: the file; .xz and .gz are recognised by content.
         layout: names, delimiter and header of its columns.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Raises:
         LogError: no samples, a field that is not a number, a line of another length, no text file.
@@ -144,7 +144,7 @@ def read_columns(path: AnyPath, layout: TextLayout, findings: Findings = None) -
 
 
 def _refuse_nul(file: str, data: bytes, line: int) -> None:
-    """Raise if the bytes, whose first line has this number, cannot be text."""
+    """Raise if the bytes contain NUL; `line` is the number of their first line."""
     if b"\0" in data:
         utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
         cause = "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole"
@@ -153,7 +153,7 @@ def _refuse_nul(file: str, data: bytes, line: int) -> None:
 
 
 def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
-    """Blocks of whole lines, True; then what follows the last line end, if anything, False."""
+    """Blocks of complete lines, with True; then any rest after the last line end, with False."""
     line, rest = 1, b""  # rest begins on this line
     pending: list[bytes] = []
     for block in source:
@@ -176,7 +176,7 @@ def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
 
 
 def _split(data: bytes, line: int) -> tuple[bytes, bytes]:
-    """Whole lines, and what follows the last line end."""
+    """Complete lines, and the rest after the last line end."""
     if line == 1:
         data = data.removeprefix(_BOM)
     at = data.rfind(_LF) + 1
@@ -184,7 +184,7 @@ def _split(data: bytes, line: int) -> tuple[bytes, bytes]:
 
 
 def _width(head: Head, layout: TextLayout) -> tuple[int, tuple[int, str] | None]:
-    """Fields a line, and the first line if it is shorter than the second."""
+    """Number of fields per line, and the first line if it is shorter than the second."""
     data = [d for d in head.data(layout.skip + 3) if d[0] > layout.skip]
     if not data:
         raise LogError(head.file, "holds no sample: header only", "record it again")
@@ -206,7 +206,7 @@ def _fields(line: bytes, delimiter: str | None) -> list[bytes]:
 
 
 class _BlockReader:
-    """Turns blocks of whole lines into arrays."""
+    """Converter of blocks of complete lines to arrays."""
 
     def __init__(self, file: str, layout: TextLayout, width: int):
         self.file, self.layout, self.width = file, layout, width
@@ -228,7 +228,7 @@ class _BlockReader:
             if block.strip():
                 lines = io.BytesIO(block)
                 table = np.loadtxt(lines, self.dtype, None, separator, ndmin=1, encoding="latin1")
-        except Exception:  # of the decoder of NumPy: the lines say where
+        except Exception:  # from the decoder of NumPy: line by line, the place is found
             table = None
         if table is None or len(table) != block.count(_LF):
             return self._line_by_line(block, line, cut_first)
@@ -239,7 +239,7 @@ class _BlockReader:
         return Columns(texts, self._joined(table, _NUMBER_TYPE), rows)
 
     def _joined(self, table: np.ndarray, kind: str) -> np.ndarray:
-        """The columns of one kind side by side."""
+        """Columns of one kind, stacked."""
         runs = [table[str(k)] for k, own in enumerate(self.runs) if own == kind]
         return np.hstack(runs) if runs else np.zeros((len(table), 0), kind)
 

@@ -1,9 +1,9 @@
-"""A format of text logs as data: its columns, and where they are found in a file.
+"""Formats of text logs as data: columns, and how to find them in a file.
 
-`robins.logs.text_formats` lists the formats, `read_text` and `write_text` read and write any of
-them, `robins.logs.columns` reads one from a TOML file. A column is found by its name in the header,
-which is the first line that is no comment or a comment before it; or by its place, where the column
-has one.
+`robins.logs.text_formats` lists the formats, `read_text` and `write_text` read and write them,
+`robins.logs.declared` reads one from a TOML file. A column is found by its name in the header,
+which is the first line that is no comment, or a comment before it; or by its index, if the format
+gives one.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _WAYS = {way: (k // 2, -1.0 if k % 2 else 1.0) for k, way in enumerate("FBRLDU")
 
 
 class Axes(NamedTuple):
-    """For each axis x, y, z the component along forward, right, down that it is, and its sign."""
+    """Directions of axes x, y, z: component of forward, right, down for each, and its sign."""
 
     component: tuple[int, ...]
     sign: tuple[float, ...]
 
     @classmethod
     def of(cls, ways: str) -> Axes:
-        """Make axes of three letters.
+        """Axes from three letters, such as "FLU".
 
         Raises:
-            ValueError: they are not three axes at right angles, or left-handed.
+            ValueError: the axes are not orthogonal, or left-handed.
         """
         if len(ways) != 3 or not set(ways) <= set(_WAYS):
             raise ValueError("is not three of the ways F, B, R, L, D, U, such as FLU")
@@ -62,7 +62,7 @@ class Axes(NamedTuple):
         return cls(index, sign)
 
     def to_frd(self, v: np.ndarray) -> np.ndarray:
-        """Components (n, 3) along these axes as those along forward, right, down; exact."""
+        """Convert components (n, 3) in these axes to forward, right, down; exact."""
         out = np.empty_like(v)
         out[:, self.component] = v * self.sign
         return out
@@ -73,49 +73,49 @@ class Axes(NamedTuple):
 
 
 RATES_HZ = (0.1, 1e5)
-"""Rates of which a recording is believed, where its time is made from it."""
+"""Range of plausible rates [Hz] of a recording whose time is made from its rate."""
 
-_ABOVE = 40  # lines among which a header is looked for
+_ABOVE = 40  # lines searched for a header
 _LETTER = re.compile("[A-Za-z]")
 
 ANY = "*"
 """As the name of the time, any name of the first column; among units, any of the right kind."""
 
 PAIRS: tuple[tuple[NavFrame, BodyFrame], ...] = (("NED", "FRD"), ("ENU", "RFU"))
-"""Frames that belong together."""
+"""Pairs of navigation and body frames."""
 
 Looks = Callable[[list[list[float]]], bool]
 
 
 class Column(NamedTuple):
-    """One column: value = (number * scale + offset) * unit; or a constant, which no file holds.
+    """One column: value = (number * scale + offset) * unit; or a constant that is not in the file.
 
-    In the name, ``{unit}`` stands for the unit, ``{unit_}`` for one that can be part of a name
-    (rad/s is rad_s); names separated by `` | `` are alternatives, of which the first is written.
+    In the name, ``{unit}`` stands for the unit, ``{unit_}`` for its form in names (rad_s for
+    rad/s); names separated by `` | `` are alternatives, of which the first is written.
     """
 
     holds: str  # one of `QUANTITIES`
     name: str
-    units: tuple[str, ...] = ()  # it may be in, the first is written; by default that of the SI
+    units: tuple[str, ...] = ()  # possible units, the first is written; default: SI
     scale: float = 1.0
-    place: int = 0  # from 1, where columns have places and no names
+    place: int = 0  # column number from 1, if columns have no names
     offset: float = 0.0
-    value: float | None = None  # of a constant
-    where: tuple[str, str] = ("", "")  # another column, and its text in the rows that hold this
+    value: float | None = None  # value of a constant
+    where: tuple[str, str] = ("", "")  # another column, and its text in rows with this one
 
     @property
     def unit(self) -> str:
-        """The unit that is written."""
+        """Unit for writing."""
         return self.units[0] if self.units else KINDS[QUANTITIES[self.holds]][0]
 
     @property
     def names(self) -> list[str]:
-        """The name in every unit."""
+        """Names with every unit."""
         units = [u for u in self.units or (self.unit,) if u != ANY]
         return [_named(template, u) for template in self.name.split(" | ") for u in units]
 
     def unit_of(self, name: str) -> str | None:
-        """The unit that a column of this name is in; None if it is not this column."""
+        """Unit of a column of this name; None if the name is not one of this column."""
         for template in self.name.split(" | "):
             if template == name:
                 return self.unit
@@ -142,24 +142,25 @@ class TextFormat:
     columns: tuple[Column, ...]
     separator: str = ","  # " ": any number of blanks
     decimal: str = "."  # or ","
-    rate_hz: float = 0.0  # of the rows, where no column holds their time
-    skip: int = 0  # lines before the header, or before the rows where there is none
-    body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
-    nav: str = "NED"  # or ENU, to which attitudes turn
-    states_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
+    rate_hz: float = 0.0  # of the rows, if no column has their time
+    skip: int = 0  # lines before the header, or before the rows without one
+    body: str = "FRD"  # directions of x, y, z; others than FRD and RFU are converted to FRD
+    nav: str = "NED"  # or ENU: navigation frame of attitudes
+    states_frames: bool = False  # in a comment "frames: ENU RFU", also written
     commented: bool = False  # the header is written as a comment
-    choice: bool = False  # a file has one whole set of these columns, or more
-    whole: bool = False  # its readers know no missing components
-    sparse: bool = False  # a row belongs to the tables of which it has a number
-    others: bool = False  # columns that are not named may hold anything
-    looks: Looks | None = None  # whether rows of numbers, where there are no names, are such a log
+    choice: bool = False  # a file has one or more complete sets of these columns
+    whole: bool = False  # its readers accept no missing components
+    sparse: bool = False  # a row belongs to each table of which it has a number
+    others: bool = False  # undeclared columns may hold anything
+    looks: Looks | None = None  # recognises rows of numbers without names
     source: str = ""  # the file in which it was declared
 
     def __post_init__(self):
-        """Check the row.
+        """Check the format.
 
         Raises:
-            LogError: an unknown quantity, unit or way of axes; columns that make no whole table.
+            LogError: an unknown quantity, unit or direction of axes; columns without a complete
+                table.
         """
         _check(self)
 
@@ -170,7 +171,7 @@ class TextFormat:
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
-        """The tables that it makes, of `TABLES`."""
+        """Kinds of its tables, of `TABLES`."""
         return tables_of_groups(groups_of(self.quantities))
 
     @property
@@ -180,7 +181,7 @@ class TextFormat:
 
     @property
     def stated(self) -> list[Column]:
-        """Constants, which are stated here and in no column of a file."""
+        """Constants, which are in no column of a file."""
         return [column for column in self.columns if column.value is not None]
 
     @property
@@ -190,14 +191,14 @@ class TextFormat:
 
     @property
     def delimiter(self) -> str | None:
-        """For `Layout`."""
+        """Delimiter for `TextLayout`."""
         return None if self.separator == " " else self.separator
 
     def recognise(self, head: Head) -> bool:
         """True if a file begins like this format.
 
-        One column beside the time is enough, so that what lacks is told; all are needed where the
-        time may have any name. A format whose header is a comment may lack it, where its rows tell.
+        One column besides the time suffices, so that missing ones are reported; all are needed if
+        the time may have any name. A header that is a comment may be missing, if the rows match.
         """
         found = {f.column.holds: f for f in header_by_name(self, head).found if self.named}
         if not found and (not self.named or (self.commented and self.looks)):
@@ -210,10 +211,10 @@ class TextFormat:
         return not any_name or not sort_out(self, set(found))[1]
 
     def _rows_of_numbers(self, head: Head, lines: int = 20) -> list[list[float]]:
-        """The first rows that lack nothing; none if some are not numbers, or not of one width."""
+        """First complete rows; none if some are not numeric, or differ in width."""
         data = [text for k, text in head.data(self.skip + lines) if k > self.skip]
         rows = [text.replace(self.decimal, ".").split(self.delimiter) for text in data]
-        if len({len(row) for row in rows[:2]}) == 2:  # began mid-line
+        if len({len(row) for row in rows[:2]}) == 2:  # the recording began mid-line
             rows = rows[1:]
         least = max(c.place for c in self.columns) or len(self.columns)
         if len({len(row) for row in rows}) != 1 or len(rows[0]) < least:
@@ -243,18 +244,18 @@ class FoundColumn(NamedTuple):
 
 
 class ColumnHeader(NamedTuple):
-    """The line that names the columns, or what stands for it."""
+    """Line that names the columns, or its substitute."""
 
-    line: int  # its number, or that of the last line before the rows
+    line: int  # line number, or that of the last line before the rows
     names: list[str]  # of the columns
     found: list[FoundColumn]
     all_named: bool = False  # a comment need not name every column
 
 
 def header_by_name(format: TextFormat, head: Head) -> ColumnHeader:
-    """The line that names most columns: the first that is no comment, or one near the beginning.
+    """Line that names most columns: the first that is no comment, or one near the beginning.
 
-    What a program writes above its header, such as the device and its settings, is passed over.
+    Lines above a header, such as device and settings, are skipped.
     """
     if head.names:
         return ColumnHeader(0, list(head.names), _found(format, list(head.names)), all_named=True)
@@ -271,7 +272,7 @@ def header_by_name(format: TextFormat, head: Head) -> ColumnHeader:
 
 
 def header_of(format: TextFormat, head: Head) -> ColumnHeader:
-    """The columns of a format in a file; those of a header that is a comment may do without it."""
+    """Header of a format in a file; a header that is a comment may be missing."""
     if format.named:
         header = header_by_name(format, head)
         if header.found or not format.commented:
@@ -309,7 +310,7 @@ def _found(format: TextFormat, names: list[str]) -> list[FoundColumn]:
 
 
 def sort_out(format: TextFormat, found: set[str]) -> tuple[set[str], set[str]]:
-    """Which of the quantities in a file are used, and which it lacks."""
+    """Quantities of a file that are used, and those that are missing."""
     if not format.choice:
         return found, format.quantities - found
     return whole_sets(format.kinds, format.quantities, found)
@@ -318,7 +319,7 @@ def sort_out(format: TextFormat, found: set[str]) -> tuple[set[str], set[str]]:
 def whole_sets(
     kinds: tuple[str, ...], offered: set[str], found: set[str]
 ) -> tuple[set[str], set[str]]:
-    """Set of columns of each table that is nearest to whole; the first table must be there."""
+    """Quantities used and missing, by the most complete set of each table, the first required."""
     used, lacking = found & {"time", "time_of_week", "week"}, set()
     for k, kind in enumerate(kinds):
         sets = [set(parts(groups)) for groups in TABLES[kind].needs]
@@ -332,10 +333,10 @@ def whole_sets(
 
 
 def columns_of(format: TextFormat, file: str, header: ColumnHeader) -> dict[str, FoundColumn]:
-    """Quantity -> the column that holds it.
+    """Quantity -> its column in a file.
 
     Raises:
-        LogError: columns are missing, two hold the same, or a unit is none.
+        LogError: columns are missing, two have the same quantity, or a unit is unknown.
     """
     at = partial(refused, file, f"line {header.line}")
     out: dict[str, FoundColumn] = {}
@@ -373,7 +374,7 @@ def _dated(column: Column) -> bool:
 
 
 def _check_column(column: Column, source: str) -> None:
-    """Raise if a column cannot be one."""
+    """Raise if a column is invalid."""
     at = partial(refused, source)
     quantity, where = column.holds, f"columns.{column.holds}"
     clock = quantity in ("time", "time_of_week")
@@ -402,7 +403,7 @@ def _check_column(column: Column, source: str) -> None:
 
 
 def _check(format: TextFormat) -> None:
-    """Raise if a row cannot be one."""
+    """Raise if a format is invalid."""
     at = partial(refused, format.source or f"format {format.name}")
     for column in format.columns:
         _check_column(column, format.source or f"format {format.name}")
@@ -451,7 +452,7 @@ def _check(format: TextFormat) -> None:
 
 
 def one_of(name: str, allowed: Iterable[str]) -> str:
-    """Fix for a name that is not among those allowed."""
+    """Text of the fix for a name that is not among those allowed."""
     allowed = list(allowed)
     near = get_close_matches(name, allowed, n=1)
     choose = f"hoose one of {', '.join(allowed)}"
@@ -459,12 +460,12 @@ def one_of(name: str, allowed: Iterable[str]) -> str:
 
 
 def _needs(kind: str) -> str:
-    """Columns that a table needs, in words."""
+    """Required columns of a table, in words."""
     sets = (", ".join(parts(groups)) for groups in TABLES[kind].needs)
     return f"the {kind} table needs {', or '.join(sets)}"
 
 
 def tick_of(column: Column, symbol: str) -> tuple[int, int]:
-    """Integers e and m of a time column, one of whose numbers is m * 10^e ns."""
+    """Integers e and m of a time column whose unit is m * 10^e ns."""
     _, digits, exponent = Decimal(repr(column.scale)).normalize().as_tuple()
     return CLOCKS[unit(symbol).symbol] + int(exponent), int("".join(map(str, digits)))

@@ -1,7 +1,7 @@
-"""Every format of text logs in one table: what is recognised, read, written and documented.
+"""Table of all formats of text logs, by which they are recognised, read, written and documented.
 
-A new format is a row here and a sample of it in `tests/logs/log_samples.py`. What is no table of
-numbers has a reader of its own, see `robins.logs.registry`.
+A new format is a row here and a sample in `tests/logs/log_samples.py`. Formats that are no table of
+numbers have a reader of their own, see `robins.logs.registry`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _RATE, _FORCE, _TURN, _ANGLE = ("rad/s", "deg/s"), ("m/s^2", "g"), ("rad", "deg"
 
 
 def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
-    """Columns of these units; @ in them stands for x, y, z, and % in a name for X, Y, Z."""
+    """Columns in these units; @ stands for x, y, z, and % in a name for X, Y, Z."""
     pairs = [
         (name.replace("@", axis).replace("%", axis.upper()), quantity.replace("@", axis))
         for name, quantity in zip(names.split(", "), holds.split(), strict=True)
@@ -27,11 +27,10 @@ def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
 
 
 def _format(name: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any):
-    """A row: what `TextFormat` takes, then a line for people and groups of columns.
+    """Row of a format: arguments of `TextFormat`, then a line for people and groups of columns.
 
-    With `looks`, columns are found by their order.
-
-    `rows` tells by rows of numbers where a header, by whose names columns are found, is missing.
+    With `looks`, columns are found by their order. `rows` recognises rows of numbers if a header,
+    by whose names columns are found, is missing.
     """
 
     def of(about: str, *groups: Iterable[Column]) -> TextFormat:
@@ -43,19 +42,19 @@ def _format(name: str, looks: Looks | None = None, rows: Looks | None = None, **
     return of
 
 
-# ------------------------------------------------------- how rows of numbers without names look
+# ---------------------------------------------------- recognition of rows without names
 
 Rows = list[list[float]]
 
 
 def _gnss_imu(rows: Rows) -> bool:
-    """Seconds since 1970 between 1990 and 2100; specific force of one g or so, not ten."""
+    """True for seconds since 1970 within 1990 to 2100, and specific force of about one g."""
     size = sorted(sum(a * a for a in row[1:4]) for row in rows)[len(rows) // 2]
     return all(6e8 < row[0] < 4.2e9 for row in rows) and size < 25.0
 
 
 def _kfgins_imu(rows: Rows) -> bool:
-    """Increments of one sample, less than 0.2 s apart."""
+    """True for increments of one sample, less than 0.2 s apart."""
     steps = sorted(abs(b[0] - a[0]) for a, b in itertools.pairwise(rows))
     spacing = steps[len(steps) // 2] if steps else 0.0
     small = all(abs(x) < 10.0 for row in rows for x in row[1:])
@@ -63,7 +62,7 @@ def _kfgins_imu(rows: Rows) -> bool:
 
 
 def _kfgins_gnss(rows: Rows) -> bool:
-    """Degrees that hardly change, and sigmas."""
+    """True for degrees that hardly change, and sigmas."""
     return (
         len(rows[0]) == 7
         and not _kfgins_imu(rows)
@@ -73,7 +72,7 @@ def _kfgins_gnss(rows: Rows) -> bool:
 
 
 def _kfgins_nav(rows: Rows) -> bool:
-    """A week, its second, a latitude."""
+    """True for a week, its second, a latitude."""
     return (
         len(rows[0]) == 11
         and all(0 <= row[0] < 5000 and row[0] == int(row[0]) for row in rows)
@@ -82,7 +81,7 @@ def _kfgins_nav(rows: Rows) -> bool:
 
 
 def _poses(first: int, stamps: tuple[float, float], widths: range) -> Looks:
-    """Rows of such a width, with a stamp within these and a unit quaternion from `first` on."""
+    """Test for rows of these widths, stamps in a range and a unit quaternion from `first` on."""
 
     def looks(rows: Rows) -> bool:
         return len(rows[0]) in widths and all(
@@ -255,4 +254,4 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         ),
     ),
 )
-"""All of them."""
+"""All formats of text logs."""

@@ -2,8 +2,8 @@
 
 A double holds seconds of today's Unix time only to 2.4e-7 s, so the digits are read as integers.
 Absolute stamps count from 1970-01-01 *in GPS time*: no leap seconds, as in RTKLIB's GPST and in the
-GNSS_IMU logs. Stamps of other epochs (seconds of the GPS week, since power-up) are kept as they
-are; the doctor says so when two files do not fit together.
+GNSS_IMU logs. Stamps of other epochs (seconds of the GPS week, since power-up) are kept
+unchanged; the doctor reports files that do not fit together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from robins.logs.findings import refused
 WEEK_S = 604_800
 _NS = 1_000_000_000
 GPS_EPOCH_NS, WEEK_NS = GPS_EPOCH_S * _NS, WEEK_S * _NS
-LIMIT_NS = 2**62  # 146 years; between stamps below it, differences stay within int64
+LIMIT_NS = 2**62  # 146 years; differences of stamps below it stay within int64
 _LAST_WEEK = (LIMIT_NS - GPS_EPOCH_NS) // WEEK_NS  # in 2116
 _HOUR_NS = 3600 * _NS
 _DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})", re.ASCII)
@@ -33,14 +33,14 @@ _EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
 
 
 def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers written in decimal, times 10**exponent, rounded (half up) to integers.
+    """Decimal numbers in text, times 10**exponent, rounded (half up) to integers.
 
     Args:
         text: (n,) bytes, such as b"1756402240.9610000"; blanks around the number are ignored.
-        exponent: 9 where the text counts seconds, 0 where it counts nanoseconds.
+        exponent: 9 for seconds, 0 for nanoseconds.
 
     Returns:
-        (n,) int64, and (n,) bool: False where the text is no number or beyond int64.
+        Integers (n,) int64, and mask (n,): False where the text is no number or beyond int64.
     """
     value, plain = np.zeros(len(text), np.int64), np.zeros(len(text), bool)
     if len(text):
@@ -49,21 +49,21 @@ def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.
         length = np.strings.str_len(digits)
         plain = np.strings.isdigit(digits) & (np.strings.str_len(part) <= exponent)
         plain &= np.strings.str_len(whole) + np.strings.str_len(part) > 0
-        # int64 holds all numbers of 18 digits, and those of 19 that begin with less than a 9.
+        # int64 holds all numbers of 18 digits, and those of 19 that begin with less than 9.
         plain &= (length < 19) | ((length == 19) & (digits < b"9"))
         value[plain] = digits[plain].astype(np.int64)
-    for i in np.flatnonzero(~plain):  # signs, exponents, blanks, more digits than ns, nonsense
+    for i in np.flatnonzero(~plain):  # signs, exponents, blanks, digits beyond ns, invalid text
         exact = _exactly(text[i], exponent)
         value[i], plain[i] = exact or 0, exact is not None
     return value, plain
 
 
 def _exactly(text: bytes, exponent: int, count: int = 1) -> int | None:
-    if b"_" in text:  # which Python would allow between digits
+    if b"_" in text:  # accepted by Python between digits
         return None
     try:
         number = Decimal(text.decode("ascii").strip()).scaleb(exponent) * count
-        if number.adjusted() > 18:  # do not write out 1e999999999
+        if number.adjusted() > 18:  # do not expand 1e999999999
             return None
         whole = int((number + Decimal("0.5")).to_integral_value("ROUND_FLOOR"))
     except (ArithmeticError, ValueError):
@@ -77,7 +77,7 @@ def stamps_to_ns(
     """`decimals_to_ns` for a column of a file, in units of count * 10**exponent ns.
 
     Raises:
-        LogError: a stamp is no number, or too large for the unit it is read in.
+        LogError: a stamp is no number, or too large for its unit.
     """
     if count == 1:
         time_ns, good = decimals_to_ns(text, exponent)
@@ -97,7 +97,7 @@ def stamps_to_ns(
 
 
 def ns_to_decimal(time_ns: int, exponent: int = 9) -> str:
-    """Nanoseconds over 10**exponent as exact decimal text: three decimals, more where needed."""
+    """Nanoseconds over 10**exponent as exact decimal text, with at least three decimals."""
     if not exponent:
         return str(time_ns)
     sign = "-" if time_ns < 0 else ""
@@ -113,10 +113,10 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False, ahead_s: int = 0
         date: year/month/day.
         clock: hour:minute:second with any decimals.
         utc: the stamp is UTC; the leap seconds since 1980 are added.
-        ahead_s: offset of the local clock from UTC, which is subtracted before.
+        ahead_s: offset of the local clock from UTC, which is subtracted first [s].
 
     Raises:
-        ValueError: no date or time of that form, or one 146 years or more from 1970.
+        ValueError: a date or time of another form, or 146 years or more from 1970.
     """
     day, time = _DATE.fullmatch(date), _CLOCK.fullmatch(clock)
     if not (day and time):
@@ -171,7 +171,7 @@ def dates_to_ns(
 
 
 def weeks_of(file: str, field: str, text: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """A column of GPS weeks, counted from 1980 and not folded at 1024.
+    """Column of GPS weeks since 1980, without rollover at 1024.
 
     Raises:
         LogError: a week is no number, or not from 1980 to 2116.
@@ -186,15 +186,15 @@ def weeks_of(file: str, field: str, text: np.ndarray, rows: np.ndarray) -> np.nd
 
 
 def week_to_ns(week: np.ndarray, tow_ns: np.ndarray) -> np.ndarray:
-    """GPS week (see `weeks_of`) and time of week, since 1970 in GPS time."""
+    """Nanoseconds since 1970 in GPS time, of GPS week (see `weeks_of`) and time of week [ns]."""
     return GPS_EPOCH_NS + week * WEEK_NS + tow_ns
 
 
 def unrolled(of_week_ns: np.ndarray) -> np.ndarray:
-    """Times of week that go on where they begin anew at the end of a week.
+    """Times of week [ns] continued across the end of a week.
 
     That is a step from the last hour of a week into the first hour of one; any other step back is a
-    fault, and left as it is.
+    fault, and left unchanged.
     """
     before, after = of_week_ns[:-1], of_week_ns[1:]
     late, early = WEEK_NS - before, after

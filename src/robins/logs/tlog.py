@@ -1,13 +1,13 @@
 """Telemetry of MAVLink (``.tlog``), decoded by the package pymavlink of the extra ``logs``.
 
-Read are, from the first vehicle that sends any:
+Messages read, from the first vehicle that sends any:
 
 - ``HIGHRES_IMU`` (SI, gauss), else ``SCALED_IMU``, else ``RAW_IMU`` of ArduPilot, whose units are
   those of the scaled one (mG of gravity, mrad/s, milligauss): samples and magnetic field, FRD;
 - ``GPS_RAW_INT``: fixes, with velocity over ground.
 
-Stamps are those of the vehicle, since power-up or UTC. Where the fixes have UTC and the samples do
-not, these are put on it by the order of arrival. Source: mavlink.io, common.xml.
+Stamps are those of the vehicle, since power-up or UTC. If the fixes have UTC and the samples do
+not, the latter are converted by the order of arrival. Source: mavlink.io, common.xml.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ _FIX = ("fix_type", "lat", "lon", "alt", "alt_ellipsoid", "h_acc", "v_acc", "vel
 
 
 def is_tlog(head: Head) -> bool:
-    """Begins with a plausible date and a frame."""
+    """True if a file begins with a plausible date and a frame."""
     if len(head.start) < 12 or head.start[8] not in (_ONE, _TWO):
         return False
     return _EARLIEST < _STAMP.unpack_from(head.start)[0] < _LATEST
 
 
 def read_tlog(path: AnyPath, findings: Findings = None) -> Dataset:
-    """Read inertial samples, and field and fixes where they were sent.
+    """Read inertial samples, and magnetic field and fixes if sent.
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out or assumed; without it that is issued as `LogWarning`.
+        findings: receives omissions and assumptions; without it they are issued as `LogWarning`.
 
     Raises:
         LogError: pymavlink is not installed, or there are no inertial samples.
@@ -86,20 +86,20 @@ def read_tlog(path: AnyPath, findings: Findings = None) -> Dataset:
         if _dated(gnss.time_ns) and not _dated(time_ns) and known.any():
             clock = gps_clock(file, time_ns[arrived[known]], gnss.time_ns[known], findings)
             time_ns = clock(time_ns)
-    there = field.any(axis=1)  # zeros: there is no magnetometer
+    there = field.any(axis=1)  # zeros mean no magnetometer
     mag = MagTable(time_ns[there], field[there], source=file) if there.any() else None
     samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
     return recording(file, samples, gnss, mag=mag)
 
 
 def _frames(file: str, data: Bytes, findings: Findings) -> Iterator[tuple[int, int, bytes]]:
-    """Place, number and bytes of the frames that are read."""
+    """Position, message number and bytes of the frames that are read."""
     at, end, stray = 0, len(data), 0
     while at < end:
         stamp, first, length, flags = struct.unpack(">QBBB", data[at : at + 11].ljust(11, b"\0"))
         size = {_ONE: 16, _TWO: 20 + 13 * (flags & 1)}.get(first, 0) + length
         if size <= length or not _EARLIEST < stamp < _LATEST:
-            later = _FIRST.search(data, at + 9)  # behind the stamp of the next frame
+            later = _FIRST.search(data, at + 9)  # after the stamp of the next frame
             stray, at = stray - at, later.start() - 8 if later else end
             stray += at
             continue
@@ -115,7 +115,7 @@ def _frames(file: str, data: Bytes, findings: Findings) -> Iterator[tuple[int, i
 
 
 def _topics(file: str, data: Bytes, findings: Findings) -> dict[int, UlogTopic]:
-    """Messages of the first vehicle with inertial samples, by their number.
+    """Messages of the first vehicle with inertial samples, by message number.
 
     Raises:
         LogError: pymavlink is not installed.
@@ -132,7 +132,7 @@ def _topics(file: str, data: Bytes, findings: Findings) -> dict[int, UlogTopic]:
             continue
         names = _FIX if number == _GPS else _SENSORS
         stamp = 1000 * one.time_boot_ms if number == 26 else one.time_usec
-        unit = one.id if number == 105 else 0  # of several on one vehicle
+        unit = one.id if number == 105 else 0  # one of several units on a vehicle
         sender = senders.setdefault((one.get_srcSystem(), one.get_srcComponent(), unit), {})
         sender.setdefault(number, []).append([at, stamp, *(getattr(one, x) for x in names)])
     report_left_out(findings, file, wrong, "messages have a wrong checksum")
@@ -155,7 +155,7 @@ def _dated(time_ns: np.ndarray) -> bool:
 
 
 def _stamps(file: str, topic: UlogTopic) -> np.ndarray:
-    """GPS time where the vehicle knows UTC, else time since power-up [ns]."""
+    """GPS time if the vehicle has UTC, else time since power-up [ns]."""
     time_ns = stamps(file, topic)
     return gps_of(time_ns) if _dated(time_ns) else time_ns
 

@@ -1,12 +1,12 @@
-"""Recordings of u-blox receivers (UBX), also between sentences of NMEA and corrections.
+"""Recordings of u-blox receivers (UBX), also mixed with NMEA sentences and corrections.
 
-- ``NAV-PVT``: fixes with velocity and sigmas; ``NAV-HPPOSLLH`` adds the digits behind 1e-7 deg.
-- the sentences of NMEA where there is no ``NAV-PVT``, see `robins.logs.nmea`;
-- ``ESF-MEAS``: rates and specific forces of a receiver with inertial sensors, along its own axes.
+- ``NAV-PVT``: fixes with velocity and sigmas; ``NAV-HPPOSLLH`` adds digits beyond 1e-7 deg.
+- NMEA sentences if there is no ``NAV-PVT``, see `robins.logs.nmea`;
+- ``ESF-MEAS``: rates and specific forces of a receiver with inertial sensors, in its own axes.
 
 GPS time is the time of week of a fix, in the week of its date. Inertial stamps count milliseconds
-of the receiver and are put on GPS time by the order of arrival. ``hAcc`` is taken for north and for
-east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968.
+of the receiver and are converted to GPS time by the order of arrival. ``hAcc`` is used for north
+and for east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.units import to_si
 
 _SYNC, _RTCM = b"\xb5\x62", b"\xd3\x00"
-_FAR = 1 << 16  # bytes in which a message is looked for
+_FAR = 1 << 16  # bytes searched for a message
 _HEAD = struct.Struct("<2sBBH")
 _TAG = struct.Struct("<IHH")  # of ESF-MEAS: time [ms], flags, provider
 _PVT, _HIGH, _MEAS, _RAW = 0x0107, 0x0114, 0x1002, 0x1003  # class and number
-_NAV_PVT = np.dtype(  # the oldest version; place: longitude, latitude [1e-7 deg]
+_NAV_PVT = np.dtype(  # oldest version; place: longitude, latitude [1e-7 deg]
     "<u4, <u2, u1, u1, 3u1, u1, V8, u1, u1, V2, 2<i4, <i4, V4, 2<u4, 3<i4, V8, <u4, V12"
 )
 _NAMES = "tow year month day clock valid _1 fix flags _2 place h_m _3 acc v _4 s_acc _5"
@@ -57,13 +57,13 @@ _GYRO_DEG_S, _ACCEL_M_S2 = 2.0**-12, 2.0**-10
 
 
 Frames: TypeAlias = dict[int, list[tuple[int, int]]]
-"""Place and length of the content of messages, by their kind."""
+"""Position and length of the content of messages, by kind."""
 
 
 def is_ubx(head: Head) -> bool:
-    """Begins with a message of UBX, or has one with a right checksum in its first 64 KiB.
+    """True if a file begins with a UBX message, or has a valid one in its first 64 KiB.
 
-    A capture may begin with sentences of NMEA, corrections or half a message.
+    A capture may begin with NMEA sentences, corrections or a partial message.
     """
     if head.start.startswith(_SYNC):
         return True
@@ -75,17 +75,17 @@ def is_ubx(head: Head) -> bool:
 
 
 def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
-    """Read fixes, and inertial samples where they were recorded.
+    """Read fixes, and inertial samples if recorded.
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Returns:
-        A dataset, or a table where there are only fixes or only samples.
+        A dataset, or a table if there are only fixes or only samples.
 
     Raises:
-        LogError: the file holds neither.
+        LogError: the file has neither.
     """
     file = str(path)
     data = map_file(path, findings)
@@ -107,7 +107,7 @@ def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     if imu is None:
         return gnss
     tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
-    before = np.searchsorted([at for at, _ in measured], arrived) - 1  # as a fix arrived
+    before = np.searchsorted([at for at, _ in measured], arrived) - 1  # last one before each fix
     if (known := before >= 0).any():
         clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)
         imu = replace(imu, time_ns=clock(imu.time_ns))
@@ -115,7 +115,7 @@ def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
 
 
 def _frames(file: str, data: Bytes, findings: Findings) -> Frames:
-    """Place and length of the content of each message with a right checksum, by its kind."""
+    """Position and length of the content of each message with a valid checksum, by kind."""
     found: Frames = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
     at, wrong, open_at = data.find(_SYNC), 0, -1
     while at >= 0:
@@ -142,14 +142,14 @@ def _frames(file: str, data: Bytes, findings: Findings) -> Frames:
 
 
 def _end(data: Bytes, at: int) -> int:
-    """End of the message there; 0 where it is not whole or its checksum is wrong."""
+    """End of the message at `at`; 0 if it is incomplete or its checksum is wrong."""
     end = at + _HEAD.size + int.from_bytes(data[at + 4 : at + 6], "little")
     whole = end + 2 <= len(data) and _checksum(data[at + 2 : end]) == data[end : end + 2]
     return end + 2 if whole else 0
 
 
 def _checksum(content: bytes) -> bytes:
-    """Fletcher's of 8 bits."""
+    """8-bit Fletcher checksum."""
     values = np.frombuffer(content, np.uint8).astype(np.int64)
     return bytes([values.sum() & 255, (values @ np.arange(len(values), 0, -1)) & 255])
 
@@ -157,7 +157,7 @@ def _checksum(content: bytes) -> bytes:
 def _rows(
     data: Bytes, frames: list[tuple[int, int]], kind: np.dtype
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Messages of a fixed layout, and where each lies."""
+    """Messages of a fixed layout, and their positions."""
     whole = [at for at, size in frames if size >= kind.itemsize]
     content = b"".join(data[at : at + kind.itemsize] for at in whole)
     return np.frombuffer(content, kind), np.array(whole, np.int64)
@@ -166,7 +166,7 @@ def _rows(
 def _fixes(
     file: str, data: Bytes, frames: Frames, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
-    """Fixes that have a date, and the place of each in the file."""
+    """Fixes with a date, and the position of each in the file."""
     pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
     dated = ((pvt["valid"] & _DATED) == _DATED) & (pvt["tow"] < WEEK_NS // 1_000_000)
     dated &= (pvt["year"] >= 1980) & (pvt["year"] < 2100) & (pvt["month"] - 1 < 12)
@@ -186,7 +186,7 @@ def _fixes(
     _, mine, more = np.intersect1d(pvt["tow"], high["tow"], return_indices=True)
     tows, counts = np.unique(pvt["tow"], return_counts=True)
     if len(more):
-        once = np.isin(pvt["tow"][mine], tows[counts == 1])  # a repeated one may be of another week
+        once = np.isin(pvt["tow"][mine], tows[counts == 1])  # others may be from another week
         once &= (high["invalid"][more] & 1) == 0
         mine, more = mine[once], more[once]
         place, digits = high["place"][more], high["more"][more]
@@ -207,7 +207,7 @@ def _inertial(
     for at, size in frames:
         tag, flags, _ = _TAG.unpack_from(data, at)
         room = max((size - _TAG.size) // 4 - (flags >> 3 & 1), 0)  # a calibrated time may follow
-        count = min(flags >> 11 or room, room)  # older ones state no number
+        count = min(flags >> 11 or room, room)  # older messages state no number
         words = struct.unpack_from(f"<{count}I", data, at + _TAG.size)
         read = {word >> 24 & 63: (word & 0xFFFFFF ^ 0x800000) - 0x800000 for word in words}
         for axes, rows in halves.items():

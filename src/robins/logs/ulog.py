@@ -1,15 +1,15 @@
 """PX4 flight logs (ULog, ``.ulg``), decoded by the package pyulog of the extra ``logs``.
 
-Read are, from the first instance of each topic:
+Topics read, from the first instance of each:
 
 - ``sensor_combined``: rates [rad/s] and specific force [m/s^2], forward-right-down;
 - ``vehicle_magnetometer``, else ``sensor_mag``: magnetic field [gauss];
-- ``vehicle_gps_position``, else ``sensor_gps``: fixes. Their ``eph`` is taken for north and for
-  east, as PX4's own filter does; components that the receiver calls invalid are missing.
+- ``vehicle_gps_position``, else ``sensor_gps``: fixes. Their ``eph`` is used for north and for
+  east, as in PX4's own filter; components that the receiver marks as invalid are missing.
 
-What PX4 estimated itself (``vehicle_attitude`` and the like) is no truth and is left alone. Stamps
-are microseconds since power-up. A ULog has no checksums: its framing is checked from the first byte
-to the last, a number that was altered within it cannot be noticed.
+Estimates of PX4 (``vehicle_attitude`` and the like) are not truth and are ignored. Stamps are
+microseconds since power-up. A ULog has no checksums: its framing is checked from the first byte to
+the last, but an altered number is undetected.
 """
 
 from __future__ import annotations
@@ -43,32 +43,32 @@ from robins.units import to_si
 
 MAGIC = b"ULog\x01\x12\x35"
 _START = 16  # bytes before the first message
-_HEADER = struct.Struct("<HB")  # size of what follows, type
-_MOST, _DEEPEST = 1 << 16, 20  # numbers in a message, definitions in each other
+_HEADER = struct.Struct("<HB")  # size of the content, type
+_MOST, _DEEPEST = 1 << 16, 20  # most numbers in a message, deepest nesting of definitions
 _TYPES = frozenset(b"BFIMPQARDLCSO")
-_LARGEST = 1 << 30  # bytes of a file
+_LARGEST = 1 << 30  # bytes, largest file
 _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
 _TO_CSV = "this version of the autopilot is not known; export the topic to CSV"
-_NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
+_NO_FIX, _FLAT_FIX = 2, 3  # least types of a fix, and of one with height
 
 
 class UlogTopic(NamedTuple):
-    """Fields logged of one topic."""
+    """Logged fields of one topic."""
 
     name: str
     fields: dict[str, np.ndarray]
 
 
 def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
-    """Read inertial samples, and field and fixes where they were logged.
+    """Read inertial samples, and magnetic field and fixes if logged.
 
     Args:
         path: the file, plain or compressed.
-        findings: receives what was left out; without it that is issued as `LogWarning`.
+        findings: receives omissions; without it they are issued as `LogWarning`.
 
     Raises:
-        LogError: pyulog is not installed; the log is damaged, or holds no inertial samples.
+        LogError: pyulog is not installed; the log is damaged, or has no inertial samples.
     """
     file = str(path)
     data, cut = read_whole(path, _LARGEST)
@@ -98,7 +98,7 @@ def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
 
 
 def _sound(data: bytes) -> int:
-    """Up to which byte the messages follow each other without a break."""
+    """End of the unbroken sequence of messages [bytes]."""
     at = _START
     while at + _HEADER.size <= len(data):
         size, kind = _HEADER.unpack_from(data, at)
@@ -111,11 +111,11 @@ def _sound(data: bytes) -> int:
 def _check_formats(file: str, data: bytes) -> None:
     """Refuse a definition that declares more numbers than a message has bytes: 64 KiB.
 
-    The package makes a name for each number of each definition, nested ones multiplied, before it
-    looks at a message.
+    The package makes a name for each number of each definition, multiplied by nesting, before it
+    reads a message.
 
     Raises:
-        LogError: there is one, or it contains itself.
+        LogError: there is such a definition, or one that contains itself.
     """
     formats: dict[str, list[tuple[str, int]]] = {}
     at = _START
@@ -127,7 +127,7 @@ def _check_formats(file: str, data: bytes) -> None:
             formats[name] = []
             for field in fields.split(";"):
                 of, _, length = field.partition(" ")[0].partition("[")
-                with contextlib.suppress(ValueError):  # no number, which the package refuses
+                with contextlib.suppress(ValueError):  # not a number, which the package refuses
                     formats[name].append((of, int(length.partition("]")[0] or 1)))
     sizes: dict[str, int] = {}
 
@@ -151,7 +151,7 @@ def _decode(file: str, data: bytes) -> Any:
     with extra_package(file, "a PX4 ULog"):
         from pyulog import ULog
     printed = io.StringIO()
-    # it prints what it doubts
+    # the package prints its warnings
     with decoding(damaged(file)), contextlib.redirect_stdout(printed):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
@@ -178,25 +178,25 @@ def column(file: str, topic: UlogTopic, name: str) -> np.ndarray:
     """Numbers of a field.
 
     Raises:
-        LogError: there is none of this name, or it holds text.
+        LogError: there is no field of this name, or it contains text.
     """
     if name in topic.fields:
         values = np.asarray(topic.fields[name])
         if values.dtype.kind not in "biuf":
             raise refused(file, field=f"{topic.name}.{name}")("holds text, no numbers", _TO_CSV)
-        with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+        with np.errstate(invalid="ignore"):  # a signalling NaN stays NaN
             return values.astype(np.float64)
     cause = f"has no field {name}; it has {', '.join(sorted(topic.fields))}"
     raise refused(file, field=topic.name)(cause, _TO_CSV)
 
 
 def triad(file: str, topic: UlogTopic, pattern: str, parts: str) -> np.ndarray:
-    """Three fields, (n, 3)."""
+    """Three fields as (n, 3)."""
     return np.stack([column(file, topic, pattern.format(part)) for part in parts], axis=-1)
 
 
 def stamps(file: str, topic: UlogTopic) -> np.ndarray:
-    """When it was measured, or else logged [ns]."""
+    """Times of measurement, or else of logging [ns]."""
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
     if stamps is None or stamps.dtype.kind != "u" or np.any(stamps >= LIMIT_NS // 1000):
@@ -212,7 +212,7 @@ def _field(file: str, topic: UlogTopic) -> MagTable:
 
 
 def _fixes(file: str, topic: UlogTopic) -> GnssTable:
-    """Older versions log integers of 1e-7 deg and mm, newer ones degrees and metres."""
+    """Fixes of a topic; older versions log integers of 1e-7 deg and mm, newer ones deg and m."""
 
     def either(new: str, old: str, scale: float) -> np.ndarray:
         return column(file, topic, new) if new in topic.fields else column(file, topic, old) * scale

@@ -1,8 +1,8 @@
-"""Configuration of a replay from what the doctor finds of a unit and its receiver.
+"""Configuration of a replay from properties of a unit and its receiver found by the doctor.
 
-The clock offset and the window of the velocities are found together: a velocity that is a mean over
-the last epoch and a receiver whose stamps are late look alike to the IMU, and only the positions
-tell them apart. Where they cannot, the window alone is taken, for it is the more common.
+The clock offset and the window of the velocities are found together: mean velocities over the last
+epoch and late stamps have the same effect relative to the IMU, and only the positions separate
+them. If they cannot, only the window is assumed, which is more common.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from robins.logs.motion_fit import MotionFit
 from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import ImuSignal, signal_of, windows_of
 
-_STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
-_LEAST = 20  # directions of travel
-_RIGHT_DEG = 10.0  # from right angles: slopes, trim and biases of sound drives look like less
-_RESTS = 5  # pairs of seconds at rest, for the noise
+_STRAIGHT = 0.85  # least length of the mean direction of travel that defines forward
+_LEAST = 20  # fewest directions of travel
+_RIGHT_DEG = 10.0  # from right angles; smaller angles may be due to slopes, trim and biases
+_RESTS = 5  # fewest pairs of seconds at rest to estimate noise
 _LATE_S = 0.03
-_MEDIAN = 0.4549  # of the square of a normal variable of unit variance
+_MEDIAN = 0.4549  # median of the square of a unit normal variable
 
 
 class UnitProperties(NamedTuple):
-    """Properties found in a log; None where it does not show them."""
+    """Properties found in a log; None if undetermined."""
 
     orientation_deg: tuple[float, float, float] | None = None  # roll, pitch, yaw of the mounting
-    latency_s: float | None = None  # a fix stamped t is of t - latency
+    latency_s: float | None = None  # a fix stamped t is valid at t - latency
     velocity_window_s: float | None = None
     gyro_noise: tuple[float, float, float] | None = None  # rad/sqrt(s), vehicle's axes
     accel_noise: tuple[float, float, float] | None = None  # m/s/sqrt(s)
-    left: tuple[float, float] | None = None  # unexplained share of the motion, before and with it
-    lasting_share: float | None = None  # of the variance of positions, as a replay finds it
-    rounded_deg: float | None = None  # angle from what was found to the right angles taken for it
+    left: tuple[float, float] | None = None  # unexplained shares, without and with the clock found
+    lasting_share: float | None = None  # correlated share of position variance, as in a replay
+    rounded_deg: float | None = None  # angle from the estimate to the right angles used instead
 
 
 def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
-    """Mounting, latency, velocity window and noise, as far as a log tells them.
+    """Mounting, latency, velocity window and noise, as far as a log determines them.
 
     Args:
-        imu: forward-right-down as far as is known: along the sensor's axes.
+        imu: in sensor axes, labelled forward-right-down.
         gnss: of the same log.
     """
     signal, track = signal_of(imu), None if gnss is None else track_of(gnss)
@@ -62,7 +62,7 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
     window = 2.0 * late if late is not None and late > _LATE_S else None
     if window is not None and abs(window - epoch) < 0.4 * epoch:
         window = epoch
-    # The positions did not tell how old velocities are: half an epoch is no offset of a clock.
+    # If positions do not show the age of velocities, half an epoch is no clock offset.
     if late is None and lag is not None and 0.3 * epoch < -lag < 0.7 * epoch:
         window, lag = epoch, None
     orientation, rounded_deg, C_bs = _orientation(signal, verdict)
@@ -85,10 +85,10 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
 def _lowered(
     plain: ModelChoice, verdict: ModelChoice, found: MotionFit
 ) -> tuple[float, float] | None:
-    """Share of the motion left unexplained without and with what was found of the clock.
+    """Unexplained shares of the motion without and with the clock found.
 
-    None if the share does not fall by more than its own uncertainty, from the scatter of the
-    stretches: nothing is written that is not shown to be better.
+    None if the share does not fall by more than its uncertainty, from the scatter of the stretches:
+    only significant improvements are written.
     """
     before, after = plain.nothing.by_stretch(plain.views), found.by_stretch(verdict.views)
     if len(before) == len(after):
@@ -104,7 +104,7 @@ def _lowered(
 def _orientation(
     signal: ImuSignal, verdict: ModelChoice
 ) -> tuple[tuple[float, float, float] | None, float | None, np.ndarray | None]:
-    """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, how far rounded, and C_bs."""
+    """Roll, pitch, yaw [deg] of the vehicle relative to the sensor, angle of rounding, and C_bs."""
     v_b = in_body(verdict)
     if len(v_b) < _LEAST:
         return None, None, None
@@ -128,9 +128,9 @@ def _orientation(
 
 
 def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> dict:
-    """Random walks by means over a second at rest: half the mean square of their differences.
+    """Random walks from means over a second at rest: half the mean square of their differences.
 
-    The median tells it, so that the seconds in which the vehicle sets off do not count.
+    Estimated by the median, which is insensitive to the seconds in which the vehicle starts.
     """
     signal = signal_of(imu)
     if signal is None:
@@ -159,13 +159,13 @@ def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> di
 def toml_of(
     found: UnitProperties, log: str, usual: Mapping[str, tuple[float, ...]] | None = None
 ) -> str:
-    """A configuration of `robins replay` with what was found; the rest is the default.
+    """Configuration of `robins replay` with the properties found; the rest is default.
 
     Args:
         found: by `find_unit`.
         log: name of the log, for the first line.
-        usual: noise that a replay takes, by its name; less at rest is a comment, for in motion
-            errors of scale and axes add to it.
+        usual: default noise of a replay, by name; a smaller value at rest becomes a comment, since
+            in motion errors of scale and axes add to it.
     """
     lines = [f"# Found by `robins doctor` in {log}; what is not here is the default.", ""]
     if found.left is not None:

@@ -1,8 +1,8 @@
-"""Writing inertial samples, magnetic field and fixes as ROS 2 records them, in an MCAP file.
+"""Writing of inertial samples, magnetic field and fixes as a ROS 2 recording in an MCAP file.
 
-Profile "ros2" of MCAP (mcap.dev/spec/registry). Topics have the names that drivers usually give:
-``/imu/data_raw``, ``/imu/mag``, ``/gnss/fix``. Axes of sensors become forward-left-up, covariances
-east-north-up. Stamps that are GPS time become UTC, others stay.
+Profile "ros2" of MCAP (mcap.dev/spec/registry). Topics have the usual names of drivers:
+``/imu/data_raw``, ``/imu/mag``, ``/gnss/fix``. Axes of sensors are converted to
+forward-left-up, covariances to east-north-up, GPS time to UTC; other stamps are unchanged.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from robins.logs.ros_files import mcap_package
 from robins.logs.tables import Table, kind_in_text, tables_of
 
 _LATEST_NS = (1 << 31) * 1_000_000_000
-_BLOCK = 2000  # messages that are handed to the file at once
+_BLOCK = 2000  # messages per write to the file
 _STATUS = {3: 1, 4: 2, 1: 2, 2: 2}  # RTKLIB's Q -> status of a NavSatFix; else 0, a plain fix
 
 
 class _Topic(NamedTuple):
-    """Writer of the rows of a table."""
+    """Topic and message maker of a table."""
 
     name: str
     frame_id: str
     kind: type[ros.Message]
-    make: Callable[[Any, int], ros.Message]  # of a table, from its row
+    make: Callable[[Any, int], ros.Message]  # message of a row of the table
 
 
 def _imu(table: ImuTable, k: int) -> ros.Message:
@@ -63,13 +63,14 @@ _TOPICS: dict[type[Any], _Topic] = {
 def write_rosbag(path: AnyPath, table: Table | Dataset) -> None:
     """Write tables; `robins.logs.rosbag.read_rosbag` reads them back.
 
-    Velocities of fixes have no place in a NavSatFix: they are left out, and a `LogWarning` says so.
-    Neither has a fix of which one sigma is missing: then none is known. Of the qualities 1, 2 and 4
-    of RTKLIB all become "with ground-based augmentation".
+    A NavSatFix has no velocity, so those of fixes are omitted, with a `LogWarning`; nor can it have
+    a single missing sigma: then all are marked unknown. Qualities 1, 2 and 4 of RTKLIB all become
+    "with ground-based augmentation".
 
     Raises:
-        LogError: a table of another kind, increments, or a time that ROS cannot say; the package
-            `mcap` is not installed; or the file cannot be written. No part of it is left behind.
+        LogError: a table of another kind, increments, or a time outside the range of ROS; the
+            package `mcap` is not installed; or the file cannot be written. No part of it is left
+            behind.
     """
     tables = tables_of(table)
     for one in tables:
@@ -81,7 +82,7 @@ def write_rosbag(path: AnyPath, table: Table | Dataset) -> None:
 
 
 def _check(file: str, table: Table) -> None:
-    """Refuse what these messages do not hold."""
+    """Refuse tables that these messages cannot represent."""
     if type(table) not in _TOPICS:
         held = "inertial samples, magnetic field and fixes"
         cause = f"ros-mcap holds {held}, not {words_of(kind_in_text(table))}"
@@ -95,7 +96,7 @@ def _check(file: str, table: Table) -> None:
 
 
 class _Sink:
-    """File object for the writer of MCAP; returns the bytes written, in pieces."""
+    """File object for the MCAP writer; returns the bytes written, in pieces."""
 
     def __init__(self) -> None:
         self._waiting = bytearray()
@@ -116,7 +117,7 @@ class _Sink:
 
 
 def _blocks(file: str, tables: list[Table]) -> Iterator[bytes]:
-    """The file, in pieces; messages in the order of their times."""
+    """Pieces of the file, with messages in order of time."""
     with mcap_package(file):
         from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
         from mcap.writer import Writer
@@ -127,7 +128,7 @@ def _blocks(file: str, tables: list[Table]) -> Iterator[bytes]:
     for topic in topics:
         name, text = ros.name_of(topic.kind), ros.definition(topic.kind).encode()
         schema = writer.register_schema(name, SchemaEncoding.ROS2, text)
-        about = {"offered_qos_profiles": ""}  # the profile wants it
+        about = {"offered_qos_profiles": ""}  # required by the profile
         channels.append(writer.register_channel(topic.name, MessageEncoding.CDR, schema, about))
     times = [_utc(one.time_ns) for one in tables]
     which = np.repeat(np.arange(len(tables)), [len(one) for one in tables])

@@ -1,4 +1,4 @@
-"""Writing a table as a text log of any format; numbers are those that read back the same."""
+"""Writing of a table as a text log of any format, with numbers that read back unchanged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from robins.units import from_si, unit
 
 _CLOCKS = ("time", "time_of_week")
 _ROWS = 50_000
-_STEEP = 1.5  # rad; nearer to the vertical roll and heading lose digits
+_STEEP = 1.5  # rad of pitch; closer to the vertical, roll and heading lose digits
 Values = dict[str, np.ndarray]  # by quantity, SI
 Groups = dict[str, np.ndarray | None]
 Cells = tuple[np.ndarray, Column]
@@ -45,7 +45,7 @@ def write_text(
     week: int | None = None,
     origin: Origin | None = None,
 ) -> None:
-    """Write a log of this format; `robins.logs.write_log` says more of the arguments.
+    """Write a log of this format; arguments as in `robins.logs.write_log`.
 
     Raises:
         LogError: the format does not hold such a table, or the file cannot be written.
@@ -80,7 +80,7 @@ def write_text(
 
 
 def _check(format: TextFormat, path: AnyPath, table: Table) -> None:
-    """Refuse what the format does not hold."""
+    """Refuse a table that the format cannot hold."""
     kind = kind_in_text(table)
     if kind not in format.kinds:
         held = " and ".join(map(words_of, format.kinds))
@@ -111,7 +111,7 @@ def _check(format: TextFormat, path: AnyPath, table: Table) -> None:
 
 
 def _groups(format: TextFormat, table: Table, origin: Origin | None) -> Groups:
-    """Groups of quantities of a table; None where there is none."""
+    """Groups of quantities of a table; None for missing ones."""
     if isinstance(table, MagTable):
         return {"mag": table.field_t}
     if isinstance(table, OdometryTable):
@@ -127,7 +127,7 @@ def _groups(format: TextFormat, table: Table, origin: Origin | None) -> Groups:
     if table.kind == "rate":
         return {"gyro": table.gyro, "accel": table.accel}
     elapsed = np.diff(table.time_ns) * 1e-9
-    # The first row has no row before it; the usual interval stands in.
+    # the first row has no previous row; use the usual interval
     usual = [np.median(elapsed) if len(elapsed) else np.nan]
     dt = np.concatenate([usual, elapsed])[: len(table), None]
     return {"dtheta": table.gyro, "dv": table.accel, "dt": dt}
@@ -160,11 +160,11 @@ def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> Group
 
 
 def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> Groups:
-    """As quaternions where the format has them and angles would lose digits, else as angles."""
+    """Attitudes as angles, or quaternions if the format has them and angles would lose digits."""
     q = jnp.asarray(q_nb)
     if "roll" not in format.quantities:
         return {"quaternion": q_nb}
-    # roll, pitch and heading are those of the vehicle, the same in both pairs of frames
+    # roll, pitch and heading are the same in both pairs of frames
     roll, pitch, heading = map(np.asarray, rotation.to_euler(q))
     angles = np.stack([roll, pitch, np.mod(heading, 2.0 * np.pi)], axis=-1)
     steep = np.nanmax(np.abs(angles[:, 1]), initial=0.0) > _STEEP
@@ -198,7 +198,7 @@ def _together(
 def _cells(
     columns: list[Column], time_ns: np.ndarray, values: Values, week: int | None
 ) -> dict[int, Cells]:
-    """Columns by place from 0: texts as they are, integers of a week or nanoseconds, floats."""
+    """Columns by index from 0: texts unchanged, integers of a week or nanoseconds, floats."""
     absolute = len(time_ns) > 0 and bool(time_ns[0] >= GPS_EPOCH_NS)
     since_ns = time_ns - GPS_EPOCH_NS if absolute else time_ns
     weeks = since_ns // WEEK_NS + (0 if absolute else week or 0)

@@ -1,11 +1,11 @@
-"""Systems: one problem each, with model, scenarios, filters and claims; here is the registry.
+"""Systems, one per problem, with model, scenarios, filters and claims; and their registry.
 
-A system of your own needs no place in here: `robins.systems.finding` takes it from your file or
+A system of your own needs no entry here: `robins.systems.finding` takes it from your file or
 package.
 
-Names are imported when they are used: a program that needs the model of one system alone, such as
-a process of the test bench, does not wait for all of them, and `robins.systems.catalogue` lists
-all without importing one.
+Names are imported on first use: a program that needs the model of a single system, such as a
+process of the test bench, does not wait for the others, and `robins.systems.catalogue` lists all
+systems without importing any.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ __all__ = [
 
 
 class _Registry(Mapping[str, "System"]):
-    """Systems by name; each is imported when it is taken out."""
+    """Systems by name, each imported on first access."""
 
     def __getitem__(self, name: str) -> System:
         if name in SUMMARIES:

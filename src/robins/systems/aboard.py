@@ -1,4 +1,4 @@
-"""The instruments that a filter has: as it believes them, and what it takes of each."""
+"""Instruments of a filter: its sensor models, and the measurements that it takes from a world."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from robins.filters import Sensor
 from robins.systems.study import Instrument
 
 Taken = tuple[tuple[str, Any], ...]
-"""Name of each sensor of a filter, and `Instrument.taken`."""
+"""Pairs of a sensor's name and its `Instrument.taken`."""
 
 
 def filter_instruments(
     instruments: Iterable[Instrument], given: Any, course: Any
 ) -> tuple[tuple[Sensor, ...], Taken]:
-    """Instruments as a filter believes them, and what it takes of the world, of those it has."""
+    """Sensor models of the instruments that a vehicle has, and how to take their measurements.
+
+    An instrument whose `believed` gives None is left out.
+    """
     every = [(i, i.believed(given, course)) for i in instruments]
     there = [(i, sensor) for i, sensor in every if sensor is not None]
     return tuple(sensor for _, sensor in there), tuple((i.name, i.taken) for i, _ in there)
 
 
 def taken(of: Taken, world: Any) -> dict[str, Any]:
-    """``y`` and ``aux`` of the `Case` of a filter with these sensors; pure."""
+    """Measurements ``y`` and auxiliary inputs ``aux`` of a filter's `Case`, by sensor; pure."""
     seen = {name: take(world) if take else (world.readings[name], None) for name, take in of}
     aux = {name: aux for name, (_, aux) in seen.items() if aux is not None}
     return {"y": {name: y for name, (y, _) in seen.items()}, "aux": aux}

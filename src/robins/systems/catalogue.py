@@ -27,17 +27,16 @@ SUMMARIES = {
 
 @cache
 def installed() -> dict[str, Any]:
-    """Systems of other packages by name; a name that robins has is that of robins.
+    """Entry points of the systems of other packages, by name; names of robins take precedence.
 
-    Each is an `EntryPoint`: that of the standard library, or of its backport where a package has
-    brought that.
+    Each is an `EntryPoint` of the standard library, or of its backport where that is installed.
     """
     found = entry_points(group="robins.systems")
     return {point.name: point for point in found if point.name not in SUMMARIES}
 
 
 def summaries() -> dict[str, str]:
-    """A sentence on each system; of an installed package it is that of the package."""
+    """One-sentence summary of each system; for an installed package, the summary of the package."""
 
     def sentence(point: Any) -> str:
         return "" if point.dist is None else str(point.dist.metadata["Summary"])
@@ -46,26 +45,26 @@ def summaries() -> dict[str, str]:
 
 
 def is_file(name: str) -> bool:
-    """True if a system is named by a file of Python, such as "my_system.py:study"."""
+    """True if a name refers to a Python file, such as "my_system.py:study"."""
     return name.partition(":")[0].endswith(".py")
 
 
 class ListedScenario(NamedTuple):
-    """A scenario file and what it is about."""
+    """A scenario file with its title and study."""
 
     path: Path
     title: str
-    study: str  # "" where the system has one alone
+    study: str  # "" where the system has only one
 
 
 @cache
 def listed(system: str) -> dict[str, ListedScenario]:
-    """Packaged scenarios of a system by name, those of a study together.
+    """Packaged scenarios of a system by name, grouped by study.
 
-    A file of its folder that states no number of runs configures a replay and is no scenario.
+    A file of its folder without a number of runs configures a replay and is no scenario.
 
     Args:
-        system: name; one that comes without a folder of scenarios has none.
+        system: name; a system without a folder `scenarios` has none.
     """
     found: dict[str, ListedScenario] = {}
     for path in _files(system):
@@ -77,7 +76,7 @@ def listed(system: str) -> dict[str, ListedScenario]:
 
 
 def configurations(system: str) -> dict[str, Path]:
-    """The other packaged files of a system by name: what is believed of something recorded."""
+    """Packaged configurations of replays of a system, by name."""
     return {path.stem: path for path in _files(system) if path.stem not in listed(system)}
 
 

@@ -1,8 +1,8 @@
-"""Systems by name: of robins, of an installed package, or in a file of the user's.
+"""Lookup of systems by name: of robins, of an installed package, or in a file of the user.
 
-A file is named with what it defines, "my_system.py:study": a `System`, or a `Study`, which is taken
-for a system that has no other. The file is imported, so it runs, and it can import the modules of
-its folder; `robins.systems.trust` says which files may.
+A file is given with the name it defines, "my_system.py:study": a `System`, or a `Study`, which
+becomes a system with that study alone. The file is imported, so it runs, and it can import the
+modules of its folder; `robins.systems.trust` decides which files may run.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from robins import systems  # whose names are imported when needed: a rig needs no study
+from robins import systems  # its names are imported on first use: a rig needs no study
 from robins.errors import RobinsError, hint
 from robins.systems import trust
 from robins.systems.catalogue import is_file
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 
 class UnknownSystem(RobinsError, ValueError):
-    """A name that is no system, or an object that is none."""
+    """A name without a system, or an object that is neither a system nor a study."""
 
 
 def find_system(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> System:
-    """The system of a name in `robins list`, or of "file.py:name", relative to a folder.
+    """The system with a name as in `robins list`, or "file.py:name", relative to a folder.
 
     Args:
         name: of the system.
         folder: to which a file is relative.
-        named_in: file that names it; empty where the user does.
+        named_in: file that names it; empty if the user named it.
 
     Raises:
         UnknownSystem: there is none; the message lists the known ones.
@@ -70,7 +70,7 @@ def _of_file(name: str, folder: Path, named_in: str | os.PathLike[str]) -> Syste
 
 
 def imported(path: Path) -> ModuleType:
-    """A file that the user names, or has confirmed, as a module.
+    """Import, as a module, a file that the user has named or confirmed.
 
     Raises:
         UnknownSystem: there is no such file, or it cannot be imported.
@@ -87,7 +87,7 @@ def imported(path: Path) -> ModuleType:
 
 
 def _place(path: Path, error: Exception) -> str:
-    """The file, and the line of it that the error names: of the syntax, or the last called."""
+    """File and line of an error: of the syntax error, or of the last call in this file."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == path:
         return f"{path}, line {error.lineno}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -96,7 +96,7 @@ def _place(path: Path, error: Exception) -> str:
 
 
 def as_system(name: str, found: Any, where: str) -> System:
-    """A system for what was defined under a name.
+    """The object defined under a name, as a system.
 
     Raises:
         UnknownSystem: it is neither a system nor a study.

@@ -1,13 +1,13 @@
-"""A study of a model that is true: the world is drawn from what its filters believe.
+"""A study without model mismatch: the world is drawn from the model of its filters.
 
 For a first system. The true state at the start is drawn from the belief, and then
 
     x+ = retract(f(x), L w),    y = retract(h(x), R v),    w, v ~ N(0, I)
 
-L and R the factors of the model's noise. A right filter is then consistent: its errors are as large
-as its sigmas, and its NEES and NIS lie in their bands. Replace parts of the study by
-`dataclasses.replace` as the system grows: a `simulate` of its own when the world differs from the
-model, a `view` when the report needs axes.
+with L and R the factors of the model's noise. A correct filter is then consistent: its errors
+are as large as its sigmas, and its NEES and NIS lie in their bands. Replace parts of the study by
+`dataclasses.replace` as the system grows: `simulate` when the world differs from the model, `view`
+when the report needs axes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def study_from_model(
     claims: Mapping[str, Claim] | None = None,
     parameters: type[ParametersT] | None = None,
 ) -> Study[ParametersT, Believed, Case]:
-    """A study whose runs are drawn from a model, and navigated by filters that believe it.
+    """A study whose runs are drawn from a model and estimated by filters that assume it.
 
     Args:
         model: motion and sensors, without inputs; or a function of the parameters.
@@ -62,11 +62,12 @@ def study_from_model(
         faults: (key, readings by sensor with leading axis E) -> readings as they come: outliers,
             or NaN where one is missing. Pure; draws come from the key.
         claims: by id, checked after a campaign.
-        parameters: what `model` and `start` are functions of, a subclass of `Scenario`.
+        parameters: subclass of `Scenario`, the argument of `model` and `start` where they are
+            functions.
 
     Raises:
-        ValueError: there is no step, or no filter; when a run is laid out, states or readings are
-            named that the model has not.
+        ValueError: there is no step, or no filter; raised when runs are laid out: states or
+            readings are named that the model does not have.
     """
     require(steps > 0, "a study needs a step at least", steps)
     require(filters, "a study needs a filter at least")
@@ -125,10 +126,10 @@ def drawn(
 
 
 def blocks(start: Belief, states: Mapping[str, str] | None) -> list[StateBlock]:
-    """A block for each component of the error.
+    """State block of each component of the error.
 
     Raises:
-        ValueError: there are not as many names as components.
+        ValueError: the number of names differs from that of components.
     """
     n = start.factor.shape[-1]
     named = dict.fromkeys((f"x{k}" for k in range(n)), "1") if states is None else states
@@ -140,10 +141,10 @@ def blocks(start: Belief, states: Mapping[str, str] | None) -> list[StateBlock]:
 
 
 def axes(model: Model, readings: Mapping[str, str]) -> dict[str, SensorAxes]:
-    """Axes of each sensor.
+    """Units and names of the components of each sensor.
 
     Raises:
-        ValueError: a sensor is named that the model has not.
+        ValueError: a sensor is named that the model does not have.
     """
     known = model.dims
     unknown = ", ".join(set(readings) - set(known))

@@ -1,4 +1,4 @@
-"""Evaluation of the filters of a study: claims with a number, their verdicts, consistency."""
+"""Evaluation of the filters of a study: quantified claims, their verdicts, consistency."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ Metric = float | int | str | list | Probability | None
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
 Band = Sequence[float | int | None]  # from, to
 Verdicts = list[dict[str, Any]]  # of claims, as `summary.json` has them
-Judge = Callable[..., Verdicts]  # (metrics, metrics of draws of the runs) -> verdicts
-MOST_MORE = 1e4  # times as many runs, beyond which a verdict is not worth waiting for
-RUNS = "runs"  # in the metrics of draws: of how many runs they are
+Judge = Callable[..., Verdicts]  # (metrics, metrics of bootstrap draws of runs) -> verdicts
+MOST_MORE = 1e4  # times as many runs: more are not proposed for a verdict
+RUNS = "runs"  # key, in the metrics of draws, of the number of runs
 
 
 class Claim(NamedTuple):
     """A claim and the figure that decides it."""
 
     text: str
-    needs: tuple[str, ...]  # filters that must have been run, and exist, for a verdict
-    value: Callable[[Metrics], Any]  # None: there is no verdict
-    band: Band | None  # in which it is reproduced
+    needs: tuple[str, ...]  # filters that must exist and have been run for a verdict
+    value: Callable[[Metrics], Any]  # gives None: no verdict
+    band: Band | None  # of the value, in which the claim is reproduced
     partly: Band | None = None
-    verdict: Callable[[Metrics], str] | None = None  # decides where no band of the value does
+    verdict: Callable[[Metrics], str] | None = None  # decides if given, instead of the bands
     tested: bool = False  # the value or its band states a confidence, so it has no interval
 
 
 def graded(good: bool | np.bool_, fair: bool | np.bool_ = False) -> str:
-    """A verdict from two answers."""
+    """The verdict "reproduced" if good, else "partly" if fair, else "not"."""
     return "reproduced" if good else "partly" if fair else "not"
 
 
 def ratio(ours: str, theirs: str, metric: str) -> Callable[[Metrics], float]:
-    """A metric of one filter over that of another."""
+    """Ratio of a metric of one filter to that of another, as a function of the metrics."""
     return lambda metrics: _ratio(metrics[ours][metric], metrics[theirs][metric])
 
 
@@ -53,9 +53,10 @@ def ratio_claims(
     """Claims that one filter is better than others, by id.
 
     Args:
-        rows: the filter, the others, of which the best counts, metrics, of which the worst ratio to
-            that counts, and the bands in which the claim is reproduced and partly so.
-        texts: of the claims.
+        rows: by id: filter, others, metrics, and the bands in which the claim is reproduced and
+            partly so. The value is the largest, over the metrics, of the filter's metric over the
+            least of the others'.
+        texts: of the claims, by id.
     """
     for key, (_, _, keys, *_) in rows.items():
         for metric in keys:
@@ -76,17 +77,17 @@ def ratio_claims(
 
 
 def _ratio(ours: float, best: float) -> float:
-    """`ours` over `best`, which is zero in a draw of few runs in which none diverged."""
+    """`ours` over `best`; `best` may be zero, as in a draw of few runs in which none diverged."""
     if best:
         return ours / best
     return math.inf if ours else math.nan
 
 
 def check_words(text: str, metric: str) -> None:
-    """Refuse a claim on a NEES whose words do not name what the NEES is of.
+    """Refuse a claim on a NEES whose text does not name the states of that NEES.
 
     Raises:
-        ValueError: they do not.
+        ValueError: they are not named.
     """
     of = metric.removeprefix("nees_").replace("_", " ")
     require(
@@ -99,18 +100,18 @@ def nees_claim(text: str, filter_: str, of: str, band: Band) -> Claim:
     """Claim on the mean NEES per degree of freedom of a block, or of "all_states".
 
     Raises:
-        ValueError: the words do not name the block.
+        ValueError: the text does not name the block.
     """
     check_words(text, metric := f"nees_{of}")
     return Claim(text, (filter_,), lambda metrics: metrics[filter_][metric], band)
 
 
 def claim_judge(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) -> Judge:
-    """The judge of the claims stated, by id, where their filters were run.
+    """The judge of the stated claims whose filters were run; of all claims if none are stated.
 
-    All claims are judged where none are stated. A second argument are metrics of runs that were
-    drawn from those of the first, see `interval_of`; with it a verdict is "undecided" where the
-    interval of the value reaches beyond the edge of a band.
+    Its optional second argument is a sequence of metrics of bootstrap draws of the runs, see
+    `interval_of`; a verdict is then "undecided" if the interval of the value crosses the edge of a
+    band.
 
     Raises:
         ValueError: the study has no claim of this id.
@@ -122,7 +123,7 @@ def claim_judge(claims: Mapping[str, Claim], stated: Sequence[str] | None = None
 
 
 def judge_filters(filters: Sequence[str], judge: Judge) -> Judge:
-    """Verdicts on these filters alone, whatever else was run with them."""
+    """A judge that sees only the metrics of these filters, whichever others were run."""
 
     def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> Verdicts:
         chosen = [{k: m for k, m in one.items() if k in filters} for one in (metrics, *drawn)]
@@ -163,17 +164,18 @@ def interval_of(
 ) -> list[float] | None:
     """95 % interval of a value by a paired bootstrap over the runs (Efron & Tibshirani 1993, 13).
 
-    The percentiles of the draws, moved away from the value by the factor sqrt(n / (n - 1)) t / z by
-    which a normal mean of n runs scatters more than draws from them.
+    The percentiles of the draws, widened about the value by sqrt(n / (n - 1)) t / z, the factor by
+    which the bootstrap understates the interval of the mean of n normal runs.
 
     Args:
-        value_of: the value of metrics.
-        value: that of all runs.
-        drawn: metrics of draws of the runs, the same runs for all filters; the first are of all
-            runs, each once. Each filter has their number under `RUNS`.
+        value_of: function of the metrics.
+        value: its value over all runs.
+        drawn: metrics of draws of the runs, the same runs for all filters; the first of all
+            runs, each once. Each filter has the number of runs under `RUNS`.
 
     Returns:
-        From, to; None: there are no draws, or the value does not follow from figures of each run.
+        Lower and upper end; None: there are no draws, or the value is no function of figures of
+        single runs.
     """
     if not drawn or not isinstance(value, int | float) or not math.isfinite(value):
         return None
@@ -212,9 +214,10 @@ def _graded(claim: Claim, value: float | int) -> str:
 def _more_runs(
     claim: Claim, value: float, interval: Sequence[float] | None, drawn: Sequence[Metrics]
 ) -> int | None:
-    """Further runs after which the interval will not reach an edge of the claim's bands.
+    """Number of further runs after which the interval should contain no edge of the claim's bands.
 
-    It shrinks with the root of the runs. None where the value is as good as at the edge.
+    Its width falls with the square root of the number of runs. None if the value lies too close to
+    an edge (`MOST_MORE`), or if no edge is in the interval.
     """
     needed = 0.0
     edges = [e for band in (claim.band, claim.partly) for e in band or () if e is not None]
@@ -230,9 +233,9 @@ def _runs_of(drawn: Sequence[Metrics]) -> int:
 
 
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Metric]:
-    """RMS error of every axis of every block in its display unit, over runs and epochs that count.
+    """RMS error of every axis of every block in its display unit, over counted runs and epochs.
 
-    Of the blocks in `all_axes` the RMS over all axes is reported too.
+    For the blocks in `all_axes` the RMS over all axes is added.
     """
     rms, out = statistics.pooled_rms, {}
     for block in statistics.blocks:
@@ -255,11 +258,11 @@ def standard_metrics(statistics: Any) -> dict[str, Metric]:
 
 
 def consistency(statistics: Any) -> dict[str, Metric]:
-    """Metrics of campaign statistics on the consistency of errors and stated covariance.
+    """Metrics of the consistency of errors with the stated covariance, from campaign statistics.
 
-    A NEES is the mean over runs and epochs, over its degrees of freedom, and named by what it is
-    of: ``nees_all_states`` or that of a block. The ANEES, whose share inside the 95 % band is
-    reported, is the mean over the runs at each epoch, of all states.
+    A NEES is the mean over runs and epochs, divided by its degrees of freedom, named by its states:
+    ``nees_all_states`` or the name of a block. The ANEES is the mean over the runs of the NEES of
+    all states at each epoch; the share of epochs inside its 95 % band is reported.
     """
     out: dict[str, Any] = {
         "error_over_sigma": statistics.overall_ratio().tolist(),
@@ -274,9 +277,9 @@ def consistency(statistics: Any) -> dict[str, Metric]:
 
 
 def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> dict[str, Claim]:
-    """Claims "sigma", "anees" and "nis" on `consistency`, with these texts.
+    """Claims "sigma", "anees" and "nis" on the metrics of `consistency`, with these texts.
 
-    They are about one filter, `judged`, or about the worst of all where none is given.
+    They concern one filter, `judged`, or the worst of all if None.
     """
     needs = () if judged is None else (judged,)
 
@@ -284,7 +287,7 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
         return [metrics[name] for name in needs or metrics]
 
     def farthest(metrics: Metrics) -> float:
-        """The grand mean NIS that is farthest from one."""
+        """Grand mean NIS farthest from one."""
         every = [1.0, *(m[k] for m in of(metrics) for k in _grand_means(m))]
         return max(every, key=lambda nis: abs(nis - 1.0))
 
@@ -314,9 +317,9 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
 
 
 def _proven(metrics: Mapping[str, Any]) -> float:
-    """Largest difference between the RMS error of a state and its sigma that is proven.
+    """Largest significant deviation from one of the ratio of RMS error to sigma, over the states.
 
-    Their ratio scatters by 10 % in 50 runs, so what counts is what its bounds leave unexplained.
+    The ratio scatters by 10 % in 50 runs, so its confidence bound nearer to one is compared.
     """
     low, high = np.transpose(metrics["error_over_sigma_bounds"])
     return float(np.max([*(low - 1.0), *(1.0 - high), 0.0]))

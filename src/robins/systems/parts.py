@@ -1,4 +1,4 @@
-"""Parameters that systems share, and the limits of a scenario."""
+"""Parameters shared by several systems, and the limits of a scenario."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
 ENU, RFU = ("east", "north", "up"), ("right", "forward", "up")
 
 MOST_RUNS = 1_000_000
-MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are half a gigabyte
+MOST_SAMPLES = 10_000_000  # of one run: 28 h at 100 Hz; six axes take half a gigabyte
 
 Runs = Annotated[int, pydantic.Field(ge=1, le=MOST_RUNS)]
 """Monte Carlo runs."""
 
 RunNumber = Annotated[int, pydantic.Field(ge=0, le=MOST_RUNS)]
-"""Number of a run, from 0; or how many."""
+"""Number of a run, from 0, or a number of runs."""
 
 HowMany = Annotated[RunNumber, pydantic.BeforeValidator(lambda x: MOST_RUNS if x == "all" else x)]
 """Number of runs, or "all"."""
 
 Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
-"""Filters by name, one at least."""
+"""Names of filters, at least one."""
 
 
 class StartPlace(Parameters):
@@ -50,7 +50,7 @@ class StartPlace(Parameters):
 
 
 def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
-    """Raise a ValueError, which names a rate, where a run has more samples than fit into memory."""
+    """Raise a ValueError naming `rate` if a run has more samples than `MOST_SAMPLES`."""
     if (samples := lasts_s * rate_hz) > MOST_SAMPLES:
         raise ValueError(
             f"{rate}: at {rate_hz:g} Hz a run of {lasts_s:g} s has {samples:.3g} samples, of which "
@@ -59,7 +59,7 @@ def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
 
 
 def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
-    """Raise a ValueError, which names a time, where figures would count from after a run's end."""
+    """Raise a ValueError naming the parameter if the settling time reaches the end of the run."""
     if from_s > 0.0 and from_s >= lasts_s:
         raise ValueError(
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
@@ -68,31 +68,31 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
 
 
 def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
-    """Mask of the times (N,) in none of some spans, (N,) bool."""
+    """Mask (N,) of the times (N,) that lie in none of the spans."""
     return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
 
 
 def during(spans: Sequence[Span | None], time_s: np.ndarray) -> np.ndarray:
-    """(N,) bool, true of the times (N,) that lie in one of some spans."""
+    """Mask (N,) of the times (N,) that lie in any of the spans; None is no span."""
     return ~outside([span for span in spans if span is not None], time_s)
 
 
 def as_array(numbers: PyTree) -> Numbers:
-    """Numbers of parameters as an array: NumPy's, which can be checked; JAX's if one is traced."""
+    """Numbers of parameters as a NumPy array, which can be checked, or a JAX array if traced."""
     return (np if _given.known(numbers) else jnp).asarray(numbers, float)
 
 
 def any_there(numbers: Sequence[Number]) -> bool:
-    """True if one of some sizes is not zero, or may not be, for it is traced."""
+    """True if any size is nonzero, or is traced and so may be nonzero."""
     return not _given.known(numbers) or any(numbers)
 
 
 Draw = Literal["normal", "plus-sigma", "random-sign"]
-"""Draw of errors of a stated size: with it as sigma, as stated, or with random signs."""
+"""Draw of errors of a stated size: normal with that sigma, exactly plus it, or of random sign."""
 
 
 def signed(key: Array, size: Listed, draw: Draw) -> Array:
-    """Errors of a stated size, of any shape."""
+    """Errors of a stated size, drawn as `draw` says; shape of `size`."""
     sigma = jnp.asarray(size, float)
     normal = jax.random.normal(key, sigma.shape)
     if draw == "plus-sigma":
@@ -104,9 +104,9 @@ class LogPartition(Parameters):
     """Partition of a recorded log into steps of a filter."""
 
     longest_block: q.Duration = default("0.25 s")
-    # a gap of the inertial samples beyond this ends a piece, and the next is aligned again
+    # a longer gap in the inertial samples ends a piece, and the next is aligned again
     longest_gap: q.Duration = default("0.5 s")
-    # process noise factor across one that is bridged
+    # factor on the process noise across a shorter gap, which is bridged
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
@@ -118,20 +118,20 @@ class Departure(StartPlace):
 
 
 class Leg(Parameters):
-    """One command of a motion over ground; which quantities it takes depends on what it does."""
+    """One command of a motion over ground, with the quantities that its kind `do` requires."""
 
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
     seconds: q.Duration | None = None
-    speed: q.SpeedSize | None = None  # at the end
+    speed: q.SpeedSize | None = None  # reached at the end
     # positive to the right
     angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
     rate: q.AngleRate | None = None
-    # gained
+    # height gained
     height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
 
     @property
     def lasts_s(self) -> float:
-        """Duration as of `robins.sim.commands`; 0 for a leg that has none."""
+        """Duration, as in `robins.sim.commands`; 0 if the leg states none."""
         if self.seconds is not None or self.angle is None or self.rate is None:
             return self.seconds or 0.0
         hold = abs(self.angle) / self.rate
@@ -162,28 +162,28 @@ _COMMANDS: dict[str, tuple[Callable[..., Manoeuvre], tuple[str, ...]]] = {
 
 
 class ImuBlock(NamedTuple):
-    """Input of one step of a motion that is mechanised from inertial samples."""
+    """Input of one step of a strapdown mechanisation."""
 
     increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
-    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
+    noise_scale: ArrayLike  # () multiplier of the process noise factor: 1, larger across an IMU gap
 
 
 def noise_of_linear(linear: Callable[..., tuple], x: PyTree, u: PyTree) -> Array:
-    """The noise of a step, the third that the linear form of its motion gives."""
+    """Process noise factor of a step, the third output of the linear form of its motion."""
     return linear(x, u)[2]
 
 
 def moved_by(step: Callable[..., PyTree], linear: Callable[..., tuple], *given: PyTree) -> Motion:
-    """A motion by its step and its linear form, which take `given` before state and input."""
+    """Motion with this step and linear form, both called with `given` before state and input."""
     slope = Partial(linear, *given)
     return Motion(Partial(step, *given), Partial(noise_of_linear, slope), slope)
 
 
-LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take
+LARGEST_RAD = np.radians(5.0)  # largest error for which a linear model holds
 
 
 def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
-    """Warn of errors [rad], by parameter, beyond 5 deg, for which linear models do not hold."""
+    """Warn of errors [rad], by parameter, above 5 deg, where linear models no longer hold."""
     large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
     if large:
         listed = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())

@@ -1,8 +1,8 @@
-"""Quantities that the parameters of several systems have, as types of their fields.
+"""Physical quantities shared by the parameters of several systems, as types of fields.
 
-A plural has three axes. A `Size` may be zero, but not negative; all others are above zero, but
-for `Angle`, `Angles` and `Arm`, which have either sign. A `Walk` is a density of white noise: that
-quantity is what it adds up to.
+A plural has three axes. A `Size` or `Time` may be zero, not negative; all others are positive,
+except `Angle`, `Angles` and `Arm`, which may have either sign. A `Walk` is the density of the white
+noise whose integral is that quantity.
 """
 
 from typing import Annotated

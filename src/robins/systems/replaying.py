@@ -1,9 +1,8 @@
-"""Recorded logs: pieces that can be run, their estimates by filters and smoothers, the outcome.
+"""Replay of recorded logs: pieces, their estimates by filters and smoothers, and the outcome.
 
-A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
-`Contender` makes its case just as it does of a simulated one. The estimates of the pieces are
-laid end to end. A system gives the preparation, its contenders, and the parts of the report that
-only it has.
+A log is cut where a gap is too long to bridge, and every piece is prepared as a world, from which a
+`Contender` makes its case just as from a simulated one. The estimates of the pieces are
+concatenated. A system provides the preparation, its contenders, and its own parts of the report.
 """
 
 from __future__ import annotations
@@ -49,29 +48,29 @@ from robins.systems.tables import (
 class LogPiece:
     """A stretch of a log without a long gap, prepared for filters; E epochs.
 
-    A system derives its own, with what else it has to know of a piece.
+    A system derives its own class to add what else it needs.
     """
 
-    world: Any  # of which a contender makes its case
+    world: Any  # input of `Contender.case`
     begin_s: float  # on the clock of the log
     epoch_s: np.ndarray  # (E,)
-    noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
+    noise_scale: np.ndarray | float = 1.0  # (E,) multiplier of the process noise factor
 
 
 class PreparedLog(NamedTuple):
-    """A log as its filters take it."""
+    """A log prepared for its filters."""
 
     pieces: Sequence[LogPiece]
-    contender: Callable[[str], Contender]  # by name; raises a ValueError where there is none
+    contender: Callable[[str], Contender]  # by name; raises a ValueError if unknown
 
 
-PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step as is `WRONG`
+PROBABILITY = "imm.probability"  # note of a bank, (modes,); kept for every step, like `WRONG`
 
 PieceT = TypeVar("PieceT", bound=LogPiece)
 
 
 class FilterEstimates(NamedTuple):
-    """Estimates of a filter or smoother on a log; leading axis E epochs of all its pieces."""
+    """Estimates of a filter or smoother on a log; leading axis E epochs, over all pieces."""
 
     name: str
     mean: Any
@@ -79,25 +78,25 @@ class FilterEstimates(NamedTuple):
     updates: Mapping[str, SensorUpdates]  # by sensor; empty for a smoother
     start: Belief  # before the first step of the last piece
     log_likelihood: float
-    tally: Tally  # how the steps went, of each piece
+    tally: Tally  # outcomes of the steps of each piece
     bounds: bool  # its sigmas are bounds of an H-infinity filter
     wrong: Mapping[str, Any] = {}  # (E,) probability by suspect
-    by_jax: str = ""  # why the interpreter could not carry the filter out
+    by_jax: str = ""  # reason why the interpreter could not run the filter
 
 
 class ReportedItems(NamedTuple):
-    """Items that the replays of a system report of every filter."""
+    """Quantities that the replays of a system report for every filter."""
 
     blocks: Sequence[StateBlock]
     sensors: Mapping[str, SensorAxes]
     # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4), the attitude, scalar
-    # first; or "euler" [rad] along the axes below, where no whole attitude is known
+    # first; or "euler" [rad] along the axes of `euler` if the attitude is only partly known
     estimates: Callable[[Any], Mapping[str, Any]]
-    causes: str  # the sentence on the likely causes, added where there is a warning
+    causes: str  # sentence on the likely causes, added to a warning
     # sensors that do not exist as devices, such as "the wheels do not slip": their noise is a guess
-    # on the cautious side, so that small innovations mean nothing
+    # on the cautious side, so that small innovations are no sign of a fault
     assumed: Collection[str] = ()
-    euler: StateBlock = EULER  # by which the attitude is reported; its frame is that of q_nb
+    euler: StateBlock = EULER  # how the attitude is reported; its frame is that of q_nb
 
 
 # -------------------------------------------------------------------------------- log to pieces
@@ -106,11 +105,11 @@ class ReportedItems(NamedTuple):
 def prepare_pieces(
     time_s: np.ndarray, dt_s: np.ndarray, longest_gap_s: float, prepare: Callable[[slice], PieceT]
 ) -> tuple[list[PieceT], list[str]]:
-    """The pieces of a log that can be run, and a sentence on each that cannot.
+    """Split a log into the pieces that can be run, and explain in a sentence each that cannot.
 
-    The inertial increments end at `time_s` (N,) and are `dt_s` (N,) long; a longer one than
-    `longest_gap_s` ends a piece and is in none. `prepare` makes a piece of rows of the log, and
-    raises a ValueError where they cannot be run.
+    The inertial increments end at `time_s` (N,) and are `dt_s` (N,) long; one longer than
+    `longest_gap_s` ends a piece and belongs to none. `prepare` makes a piece of a slice of rows,
+    and raises a ValueError if they cannot be run.
 
     Raises:
         ValueError: no piece can be run; the message gives the reason.
@@ -136,8 +135,8 @@ def noise_scale(
 ) -> np.ndarray:
     """Process noise factor (E,): 1, or `across_gap` in a block in which samples are missing.
 
-    The blocks are cut from increments of lengths `dt_s` (N,), usually `usual_s`, by default
-    found from these.
+    The blocks are made of increments of durations `dt_s` (N,), nominally `usual_s`, which is
+    found from them if not given.
     """
     gap = after_gap(dt_s, usual_s)
     missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
@@ -145,7 +144,7 @@ def noise_scale(
 
 
 def gap_counts(pieces: Sequence[LogPiece], problems: Sequence[str]) -> dict[str, int]:
-    """Numbers of gaps that ended a piece, and of blocks across a shorter one."""
+    """Numbers of gaps that ended a piece, and of blocks that bridge a shorter gap."""
     across = (np.sum(np.asarray(piece.noise_scale) > 1.0) for piece in pieces)
     return {
         "imu_gaps_declared": len(pieces) + len(problems) - 1,
@@ -157,9 +156,9 @@ def gap_counts(pieces: Sequence[LogPiece], problems: Sequence[str]) -> dict[str,
 
 
 def kept(step: Step) -> tuple[PyTree, Array, dict[str, SensorUpdates]]:
-    """Keep the posterior's mean and standard deviations and how the updates went, by sensor.
+    """Keep the posterior's mean and standard deviations, and the updates by sensor.
 
-    Of a bank also how likely each mode is.
+    For a bank, also keep the probability of each mode.
     """
     return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY, WRONG))
 
@@ -171,14 +170,14 @@ def run_filters(
     smoothers: Mapping[str, str] | None = None,
     progress: Progress = ignore_progress,
 ) -> dict[str, FilterEstimates]:
-    """Estimates of all pieces by filters and smoothers; each filter runs over a piece once.
+    """Run filters and smoothers over all pieces; each filter runs once over a piece.
 
     Args:
         pieces: of a log, in the order of time.
         wanted: names of filters and smoothers.
-        contender: the filter of a name, with its model; what it raises for another is raised here.
-        smoothers: by the name of a smoother, the filter whose run it smooths.
-        progress: called with the share done and what is being done.
+        contender: filter with its model, by name; its error for an unknown name propagates.
+        smoothers: name of each smoother -> name of the filter whose run it smooths.
+        progress: called with the fraction done and the current task.
     """
     causal = {name: (smoothers or {}).get(name, name) for name in wanted}
     contenders = {name: contender(name) for name in dict.fromkeys(causal.values())}
@@ -197,10 +196,10 @@ def run_filters(
 def _of_piece(
     piece: LogPiece, contender: Contender, smoothed: bool
 ) -> tuple[FilterEstimates, FilterEstimates]:
-    """Estimates of a filter on a piece, and of its smoother if that is requested."""
+    """Estimates of a filter on a piece, and of its smoother (if not requested, the same again)."""
     filter_, case = contender.filter, contender.case(piece.world)
     with warnings.catch_warnings():
-        # these are among the warnings of the outcome
+        # the outcome reports these among its warnings
         warnings.simplefilter("ignore", StepWarning)
         found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
         of_steps = mapped_rows(kept, found.steps) if smoothed else found.steps
@@ -219,7 +218,7 @@ def _of_piece(
 
 
 def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tuple[Solution, str]:
-    """A run by the interpreter; where that cannot carry it out, by JAX, and the reason."""
+    """Run by the interpreter, or, if it cannot, by JAX; and the reason for that ("" if none)."""
     arguments = contender.filter, contender.model, case.start, case.y, case.u, case.aux
     try:
         return run(*arguments, keep=keep, time_s=time_s, machine="vm"), ""
@@ -246,15 +245,15 @@ def _tally_of(parts: Sequence[FilterEstimates]) -> Tally:
 
 
 def epochs_of(pieces: Sequence[LogPiece]) -> np.ndarray:
-    """(E,) epochs of all pieces, as `end_to_end`: between two is the time the later begins at."""
+    """Epochs (E,) [s] of all pieces, in the order of `end_to_end`; its blank rows get `begin_s`."""
     rows = [a for piece in pieces for a in (np.array([piece.begin_s]), piece.epoch_s)]
     return np.concatenate(rows[1:])
 
 
 def end_to_end(trees: Sequence[PyTree]) -> PyTree:
-    """Join what was found of each piece, with a row of NaN between two: no curve crosses a gap.
+    """Concatenate the results of the pieces, with a row of NaN between two: no curve crosses a gap.
 
-    What holds no real number has a zero there.
+    Arrays of another type than float have a zero there.
     """
 
     def join(*leaves: ArrayLike) -> jax.Array:
@@ -279,17 +278,17 @@ def outcome(
     notes: Sequence[str],
     origin_ns: int | None = None,
 ) -> Outcome:
-    """The outcome of a replay: solution, metrics and warnings that all systems have, and its own.
+    """Outcome of a replay: the solution, metrics and warnings common to all systems, and its own.
 
     Args:
         epoch_s: (E,) on the clock of the log.
-        answers: by filter.
-        reported: of every filter.
+        answers: estimates by filter.
+        reported: quantities to report for every filter.
         metrics: figures of merit of an answer, in addition to the consistency of its innovations.
-        variables: what else is in the solution, as `robins.results` lists it.
+        variables: further variables of the solution, as `robins.results` lists them.
         counts: of samples and pieces.
         notes: sentences for the reader.
-        origin_ns: stamp of the log at which its clock here begins, kept as an attribute.
+        origin_ns: stamp of the log at time zero of `epoch_s`, kept as an attribute.
     """
     doubtful = [
         f"{name}: {sentence}."
@@ -344,7 +343,7 @@ def _tables(
 
 
 def _sigma(answer: FilterEstimates, block: StateBlock) -> np.ndarray | None:
-    """(E, k) standard deviations of a block; None where the filter has no such states."""
+    """Standard deviations (E, k) of a block; None if the filter lacks these states."""
     here = np.asarray(answer.sigma)[:, block.where]
     return here if here.shape[1] == len(block.axes) else None
 
@@ -352,7 +351,7 @@ def _sigma(answer: FilterEstimates, block: StateBlock) -> np.ndarray | None:
 def _innovations(answer: FilterEstimates) -> dict[str, Metric]:
     """Grand mean NIS with its band, and number of refusals, of each sensor with measurements.
 
-    The bound of an H-infinity filter is no covariance, so it has no NIS.
+    An H-infinity filter has no NIS, since its bound is not a covariance.
     """
     out: dict[str, Any] = {}
     for sensor, update in answer.updates.items():

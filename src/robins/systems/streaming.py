@@ -1,9 +1,9 @@
 """Common parts of live objects: refusal of samples, status of answers, the saved file.
 
-A live object takes a sample and answers at once. A sample that is no sample (another shape, text)
-raises; one that is wrong as a sensor can be (no number, absurd, out of order) is refused, counted,
-and answered from what is known. Stamps that stay elsewhere are a clock that was set, or a long
-pause: the object then starts again.
+A live object takes a sample and answers at once. A malformed sample (wrong shape, text) raises an
+error; a faulty one (not finite, absurdly large, out of order) is refused, counted, and answered
+from the present state. A lasting jump of the stamps means that the clock was set or paused for
+long: the object then starts again.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from robins.results import ResultError, snapshot
 from robins.scenario import Parameters
 from robins.scenario.text import mapping_of, text_of
 
-_STILL = 0.01  # of the specific force: how little it may scatter at rest
+_STILL = 0.01  # largest relative scatter of the specific force at rest
 
 
 class LiveError(RobinsError, ValueError):
-    """A sample, or what a live object is made with, cannot be used; the object goes on."""
+    """An unusable sample or constructor argument; the live object remains usable."""
 
 
 def online(
     filter_: Filter, model: Model, start: Belief | FilterState, machine: str
 ) -> OnlineFilter:
-    """Online filter of robins' own, the state at its start computed without a compiler."""
+    """Online filter of robins, whose initial state is computed without a compiler."""
     if isinstance(start, Belief):
         start = evaluated(partial(filter_.init, dims=model.dims), start)
     return OnlineFilter(filter_, model, start, machine=machine)
@@ -59,36 +59,36 @@ class Flag(IntFlag):
     """Status of an answer; several may hold."""
 
     STARTING = 1  # the first attitude is not known yet: no numbers
-    REFUSED = 2  # this sample was not used, `counts` has the reason
+    REFUSED = 2  # this sample was not used; `counts` gives the reason
     REST = 4  # the unit lies still
     SATURATED = 8  # a sensor is at the end of its range in this sample
-    DISTURBED = 16  # the last look at the magnetometer was refused
-    DOUBTFUL = 32  # states or innovations contradict what was assumed
-    BEHIND = 64  # the filter waits for later samples; the gyros carry on
+    DISTURBED = 16  # the last magnetometer measurement was refused
+    DOUBTFUL = 32  # states or innovations contradict the assumptions
+    BEHIND = 64  # the filter waits for later samples; the gyros propagate
     OUTLIER = 128  # the filter refused a measurement of its last step, or of one for this answer
 
 
 class TimestampGate:
-    """Gate of samples, by their stamps and sizes."""
+    """Gate that accepts or refuses samples by their stamps and magnitudes."""
 
     def __init__(self, longest_gap_s: float, patience: int):
-        """Begin.
+        """Create a gate without a stamp.
 
         Args:
-            longest_gap_s: s; a stamp further ahead is of another clock, or of a new beginning.
-            patience: stamps in a row that continue each other elsewhere until they are believed.
+            longest_gap_s: [s]; a stamp further ahead is refused, as one of another clock.
+            patience: number of refused stamps in a row, consecutive among themselves, after which
+                they are accepted as the new time.
         """
         self._gap_ns, self._patience = round(longest_gap_s * 1e9), patience
         self.last_ns: int | None = None
         self._elsewhere_ns, self._row = 0, 0
 
     def check(self, time_ns: int, values: np.ndarray) -> str:
-        """Reason why a sample is refused; "" for one that is taken, "anew" for one that starts
-        again.
+        """Reason for refusing a sample: "" if it is accepted, "anew" if it restarts the object.
 
         Args:
-            time_ns: its stamp.
-            values: (6,) rates and specific forces.
+            time_ns: its stamp [ns].
+            values: (6,) rates [rad/s] and specific forces [m/s^2].
         """
         if not np.all(np.isfinite(values)):
             return "nan" if np.any(np.isnan(values)) else "inf"
@@ -111,7 +111,7 @@ def stamp(time_ns: Any) -> int:
     """A stamp in whole nanoseconds.
 
     Raises:
-        LiveError: it is no whole number.
+        LiveError: it is not an integer.
     """
     if isinstance(time_ns, bool) or not isinstance(time_ns, int | np.integer):
         what = f"a stamp must be a whole number of nanoseconds, got {time_ns!r}"
@@ -120,10 +120,10 @@ def stamp(time_ns: Any) -> int:
 
 
 def numbers(name: str, values: Any, size: int) -> np.ndarray:
-    """(size,) floats.
+    """The values as floats (size,).
 
     Raises:
-        LiveError: it is something else.
+        LiveError: they are not `size` real numbers.
     """
     try:
         found = np.asarray(values)
@@ -136,11 +136,11 @@ def numbers(name: str, values: Any, size: int) -> np.ndarray:
 
 
 def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
-    """Refuse samples (K, 3) whose sizes are those of another unit, as the doctor of logs would.
+    """Refuse samples (K, 3) whose magnitudes indicate another unit, as the doctor of logs does.
 
     Raises:
-        LiveError: rates that no gyro reads, also where the specific force stands still; or a mean
-            specific force that is gravity in another unit.
+        LiveError: rates beyond any gyro in rad/s, or beyond any bias at rest; or a mean specific
+            force that is gravity in another unit.
     """
     spin = float(np.max(np.linalg.norm(gyro, axis=1), initial=0.0))
     fix = "if it is in deg/s, give np.radians of it"
@@ -148,7 +148,7 @@ def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
         raise LiveError(f"reads up to {spin:.0f}, which is no rate in rad/s", "gyro", fix)
     force = np.mean(accel, axis=0)
     size = float(np.linalg.norm(force))
-    # An acceleration may have the size of gravity in ft/s^2; of all other units it is far off.
+    # A true specific force may reach the size of gravity in ft/s^2, but not in other units.
     if (unit := force_unit(size)) and unit[0] != "ft/s^2":
         what = f"the mean reads {size:.4g}, which is gravity in {unit[0]}, not in m/s^2"
         raise LiveError(what, "accel", unit[1])
@@ -160,10 +160,10 @@ def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
 
 
 def refuse_field_unit(strength: float) -> None:
-    """Refuse a magnetic field whose usual strength is beyond that of any sensor in tesla.
+    """Refuse a typical magnetic field strength beyond the range of any sensor in tesla.
 
     Raises:
-        LiveError: it is.
+        LiveError: it is beyond `STRONGEST_T`.
     """
     if strength > STRONGEST_T:
         unit, fix = field_unit(strength) or ("another unit", "take it from the data sheet")
@@ -176,35 +176,35 @@ LiveT = TypeVar("LiveT", bound="Live")
 
 
 class Live:
-    """Base of the live objects: counts, and a file that keeps all they know.
+    """Base of the live objects: counts, and a file that keeps their whole state.
 
     Attributes:
-        counts: samples refused by reason, and what else happened, so often.
+        counts: numbers of refused samples by reason, and of other events.
     """
 
-    _parameters: ClassVar[type[Any]]  # those it is made with
+    _parameters: ClassVar[type[Any]]  # class of the constructor's parameters
     _kept: ClassVar[tuple[str, ...]]  # names of attributes that change, plain values or arrays
-    _parts: ClassVar[tuple[str, ...]]  # names of objects whose attributes are such
-    _on: Callable[[Belief | FilterState], OnlineFilter]  # the filter, from a start on
-    _compiled_state: PyTree = None  # some state of the filter
-    _online: OnlineFilter | None = None  # from the start on
+    _parts: ClassVar[tuple[str, ...]]  # names of objects with such attributes
+    _on: Callable[[Belief | FilterState], OnlineFilter]  # the filter from an initial state
+    _compiled_state: PyTree = None  # a filter state, for its structure and shapes
+    _online: OnlineFilter | None = None  # set at the start
 
     def __init__(self, parameters: Parameters, **made_with: Any):
-        """Remember what it is made with, for the file."""
+        """Store the constructor's arguments, for the file."""
         self.parameters: Any = parameters
         self.counts: Counter[str] = Counter()
         self._made_with = made_with
 
     def _known_states(self) -> list[PyTree]:
-        """States of the filter, the present one last; none before there is one."""
+        """States of the filter, the present one last; empty before the start."""
         return [] if self._online is None else [self._online.state]
 
     def _go_on_from(self, states: list[PyTree]) -> None:
-        """Take states of the filter, as of `_known_states`."""
+        """Set the states of the filter, as given by `_known_states`."""
         self._online = self._on(states[-1])
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all that is known into one file, whole or not at all.
+        """Write the whole state into one file, atomically.
 
         Raises:
             ResultError: it cannot be written; the message gives the reason.
@@ -213,7 +213,7 @@ class Live:
 
     @classmethod
     def load(cls: type[LiveT], path: str | os.PathLike[str]) -> LiveT:
-        """The object that `save` wrote; it goes on bit for bit.
+        """Load an object written by `save`; it continues bit for bit.
 
         Raises:
             ResultError: the file cannot be read, is damaged, or of another version or class.
@@ -227,15 +227,15 @@ class Live:
             raise ResultError(path, what, fix) from error
 
     def __reduce__(self) -> tuple:
-        """Pickle as it is saved: compiled code is compiled again."""
+        """Pickle the saved state; compiled code is compiled again on loading."""
         return _made_again, (type(self), *self._all_known())
 
     def __copy__(self: LiveT) -> LiveT:
-        """An object of its own: neither hears the samples of the other."""
+        """Deep copy, independent of the original."""
         return deepcopy(self)
 
     def _all_known(self) -> tuple[str, dict[str, Any]]:
-        """Parameters as TOML, and all else."""
+        """Parameters as TOML, and the rest of the state."""
         leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(self._known_states())]
         state = {
             "made_with": self._made_with,
@@ -248,7 +248,7 @@ class Live:
 
 
 def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> LiveT:
-    """The object of which this is known."""
+    """Rebuild an object from its parameters (TOML) and state, as of `_all_known`."""
     given = cls._parameters.model_validate(mapping_of(parameters), strict=False)
     made = cls(given, **state["made_with"])
     _compare(cls.__name__, cls._kept, state["own"])
@@ -266,7 +266,7 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
 
 
 def _state_of(part: Part) -> dict[str, Any]:
-    """Attributes of an object and of its parts, but for parameters and counts."""
+    """Attributes of an object and of its parts, without parameters and counts."""
     return {
         name: _state_of(value) if _is_part(value) else value
         for name, value in vars(part).items()
@@ -275,13 +275,13 @@ def _state_of(part: Part) -> dict[str, Any]:
 
 
 def _compare(what: str, own: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse a state with other attributes, which another robins wrote."""
+    """Refuse a state with other attributes, as written by another version of robins."""
     if differ := sorted({*own} ^ {*known}):
         raise ValueError(f"{what} differs in {', '.join(differ)}")
 
 
 def _go_on(part: Part, known: Mapping[str, Any]) -> None:
-    """Set what `_state_of` found."""
+    """Set the attributes found by `_state_of`."""
     _compare(type(part).__name__, _state_of(part), known)
     for name, value in known.items():
         if _is_part(getattr(part, name)):
@@ -295,10 +295,10 @@ def _is_part(value: Part) -> bool:
 
 
 def restored(like: PyTree, leaves: Sequence[ArrayLike]) -> PyTree:
-    """A state of the structure of another, with these leaves.
+    """A state with the structure of `like` and these leaves.
 
     Raises:
-        ValueError: the leaves of the other have other shapes.
+        ValueError: the shapes of the leaves differ from those of `like`.
     """
     own, structure = jax.tree_util.tree_flatten(like)
     if [np.shape(x) for x in own] != [np.shape(x) for x in leaves]:

@@ -1,8 +1,8 @@
-"""A study: what is simulated, who navigates it, what is claimed; and the problem made of it.
+"""Study: simulation, filters and claims of a kind of scenario; and the problem made from it.
 
-A study follows one course of work: parameters -> `lay_out` (what all runs share) -> `simulate` (one
-run) -> a `Contender` for each filter -> metrics -> verdicts. `Study.problem` is that course; the
-campaign runs any `Problem` and does not know which system it came from.
+A study is a chain: parameters -> `lay_out` (what all runs share) -> `simulate` (one run) -> a
+`Contender` for each filter -> metrics -> verdicts. `Study.problem` builds that chain; the campaign
+runs any `Problem` and does not know which system it came from.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from robins.systems.parts import HowMany, Names, RunNumber, Runs
 
 
 class StateBlock(NamedTuple):
-    """Some components of the tangent space, under a name."""
+    """A named group of components of the tangent space."""
 
     name: str
     where: slice
@@ -45,53 +45,53 @@ class SensorAxes(NamedTuple):
     units: str
     frame: str
     axes: tuple[str, ...]
-    display_unit: str = ""  # of figures, where it is another
+    display_unit: str = ""  # of figures, if not `units`
 
 
 class Case(NamedTuple):
-    """One simulated run: what a filter is given, and what it should find.
+    """One simulated run: inputs and measurements of a filter, and the truth.
 
-    In closed loop the loop gives all of this but the start.
+    In closed loop, `loop` provides all but the start.
     """
 
-    start: Belief  # or the state of a filter
+    start: Belief  # or a filter state
     u: Any  # input of the motion, leading axis E epochs
     y: Mapping[str, Any]
     aux: Mapping[str, Any]
     truth: State | None  # leading axis E
-    # (E, r, n) reported = rows @ tangent error, where what is reported turns with the time; it
-    # takes the place of the contender's
+    # (E, r, n) reported = rows @ tangent error, if the reported components vary with time;
+    # replaces `Contender.reported`
     rows: Array | None = None
-    outputs: Mapping[str, Array] = {}  # (E, k) what else is known of the run, by name
+    outputs: Mapping[str, Array] = {}  # (E, k) further outputs of the run, by name
     loop: Loop | None = None
 
 
-WorldT = TypeVar("WorldT")  # what is simulated of a run: a `Case`, or a type of the study's own
+WorldT = TypeVar("WorldT")  # a simulated run: a `Case`, or a type of the study's own
 
 
 def as_simulated(world: Any) -> Case:
-    """The case of a problem whose filters all take what is simulated as it is."""
+    """The simulated world itself, if it already is the case of every filter."""
     return world
 
 
 @dataclass(frozen=True)
 class Contender(Generic[WorldT]):
-    """A filter with the model it believes in.
+    """A filter with its model.
 
-    Filters of one problem may have states of their own: each makes its own case of the simulated
+    Filters of one problem may have different states: each makes its own case of the simulated
     world, and all report the same components.
     """
 
     filter: Filter
     model: Model
-    case: Callable[[WorldT], Case] = as_simulated  # from what the problem simulates
-    # (r, n) reported = this @ tangent error; None: all of it
+    case: Callable[[WorldT], Case] = as_simulated  # makes the case of a simulated world
+    # (r, n) reported = this matrix @ tangent error; None: the tangent error itself
     reported: np.ndarray | Array | None = None
-    bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
-    lasting: bool = False  # its gain is not that of least variance, so innovations are correlated
-    # figures known without a run, put among its metrics
+    bounds: bool = False  # its sigmas are bounds of an H-infinity filter, not standard deviations
+    lasting: bool = False  # its gain is not the optimal one, so innovations are correlated
+    # figures known without a run, added to its metrics
     facts: Mapping[str, Any] = field(default_factory=dict)
-    # why its steps call Python, "it solves ... in Python": such a filter runs by JAX alone
+    # reason why its steps call Python, "it solves ... in Python"; such a filter needs JAX
     on_host: str = ""
 
 
@@ -113,11 +113,11 @@ class Recipe:
 
 
 class Limit(NamedTuple):
-    """A size that the errors of a block should stay below."""
+    """An upper limit for the errors of a block."""
 
     name: str  # "5_arcmin"
     block: str
-    value: float  # SI, of the largest component
+    value: float  # SI, for the largest component
 
 
 class Output(NamedTuple):
@@ -133,7 +133,7 @@ class Output(NamedTuple):
 
 
 class Norm(NamedTuple):
-    """The length of some reported components of the error, such as the horizontal ones."""
+    """Norm of some reported components of the error, such as the horizontal ones."""
 
     name: str
     components: tuple[int, ...]
@@ -145,36 +145,36 @@ class Instrument(NamedTuple):
     name: str
     axes: SensorAxes
     # (parameters, course, key of a component, true motion) -> its reading, leading axis E, NaN
-    # where there is none; None: it takes what another instrument has read
+    # where there is none; None: it uses the reading of another instrument
     measure: Any
-    # (parameters, course) -> `Sensor`: h(x) and R, as a filter believes; None: the vehicle lacks it
+    # (parameters, course) -> `Sensor`: h(x) and R of the filters; None: the vehicle lacks it
     believed: Callable[..., Any]
-    # world -> the measurement, and what h(x) needs besides the state; None: the reading, nothing
+    # world -> (measurement, input of h besides the state or None); None: the reading alone
     taken: Any = None
 
 
 @dataclass(frozen=True)
 class View:
-    """Report of every filter, with the data for figures and metrics."""
+    """Contents of the report of every filter: data for figures and metrics."""
 
     epoch_s: np.ndarray  # (E,)
     blocks: Sequence[StateBlock]  # of the reported components
     sensors: Mapping[str, SensorAxes]
     metrics: Callable[[Any], dict[str, Any]] = standard_metrics  # campaign statistics -> metrics
-    # truth, fixes, outages: what figures show in addition to the filters
+    # truth, fixes, outages: shown in figures in addition to the filters
     context: xr.Dataset = field(default_factory=xr.Dataset)
-    # means of the first run by filter -> more variables of the solution, such as the track. A
-    # mean is the state of its own filter.
+    # means of the first run by filter -> further variables of the solution, such as the track;
+    # each mean is a state of its own filter
     shown: Callable[[Mapping[str, State]], dict[str, Any]] = lambda means: {}
     count_from: int = 0  # first epoch that counts for figures pooled over time
     limits: Sequence[Limit] = ()
     count_to: int | None = None  # epoch after the last that counts; None: to the end
-    bound_of: str | None = None  # the contender whose model's covariance bound is drawn in
-    norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
-    windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
+    bound_of: str | None = None  # contender whose model gives the covariance bound in figures
+    norms: Sequence[Norm] = ()  # mean and spread over time are kept for each run
+    windows: Sequence[slice] = ()  # spans of epochs; their largest errors are kept for each run
     notes: Sequence[str] = ()  # sentences for the reader of the report
-    outputs: Sequence[Output] = ()  # of its cases
-    # (E,) bool by instrument, or "motion": when it is truly wrong; None where that is not known
+    outputs: Sequence[Output] = ()  # of the cases, see `Case.outputs`
+    # (E,) bool by instrument, or "motion": true while it is at fault; None if unknown
     faults: Mapping[str, np.ndarray] | None = None
 
 
@@ -183,19 +183,19 @@ class Problem(View):
     """A simulated scenario, ready to be run any number of times.
 
     Raises:
-        ValueError: names clash, or what one part names no other part has; raised before a
-            campaign is computed whose result could not be written.
+        ValueError: names clash, or one part names something that no other part defines; raised
+            now, since the result of a campaign could not be written.
     """
 
-    simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
+    simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it can be batched
     contenders: Mapping[str, Contender]
     claims: Judge
-    # what inputs are in an exported library, by struct and field, where no axes are declared
+    # meaning of inputs in an exported library, by (struct, field), where no axes are declared
     fields: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that all names fit each other."""
-        named: dict[str, str] = {}  # what has an axis of its own, in the result
+        """Check that all names agree."""
+        named: dict[str, str] = {}  # names with an axis of their own in the result
         for what, names in (
             ("block", [b.name for b in self.blocks]),
             ("output", [o.name for o in self.outputs]),
@@ -228,15 +228,15 @@ class Problem(View):
 
 
 class Scenario(Parameters):
-    """Parameters of every simulated scenario; a study adds its own, and `study`, its name."""
+    """Parameters of every simulated scenario; a study adds its own and sets `study`, its name."""
 
     system: str = ""
     study: str = ""
     title: str = ""
     runs: Runs = 50
-    filters: Names = ()  # the usual ones of the study where none is named
-    claims: tuple[str, ...] | None = None  # ids of those it checks; None: all of the study
-    # of a campaign in a folder: runs whose histories it keeps, and of how many that diverge
+    filters: Names = ()  # empty: the usual ones of the study
+    claims: tuple[str, ...] | None = None  # ids of the claims checked; None: all of the study
+    # campaign in a folder: runs whose histories are kept, and how many diverged ones are kept
     keep: tuple[RunNumber, ...] = ()
     keep_diverged: HowMany = 0
 
@@ -251,34 +251,34 @@ def _nothing_shared(given: Scenario) -> Any:
 
 @dataclass(frozen=True)
 class Study(Generic[ParametersT, CourseT, WorldT]):
-    """One kind of scenario of a system: its parts, from which one function makes a problem.
+    """One kind of scenario of a system: its parts, from which `problem` makes a problem.
 
-    A checker of types finds the parameters, the course and the world of its functions, and whether
-    they fit each other.
+    A type checker infers the types of parameters, course and world from its functions, and checks
+    that they agree.
 
-    `lay_out` and what follows may raise a ValueError on parameters that do not fit together.
+    `lay_out` and the later steps may raise a ValueError on parameters that do not fit together.
     """
 
     parameters: type[ParametersT]
     filters: tuple[str, ...]
-    # (parameters, course, seed, run number) -> world, or a `Case` where all filters take the same;
-    # pure, the run number may be traced
+    # (parameters, course, seed, run number) -> world, or a `Case` if it is the same for all
+    # filters; pure, the run number may be traced
     simulate: Callable[[ParametersT, CourseT, int, Array], WorldT]
     # (parameters, course, name of the filter)
     contender: Callable[[ParametersT, CourseT, str], Contender[WorldT]]
     view: Callable[[ParametersT, CourseT], View]  # (parameters, course)
     # parameters -> course: what all runs share
     lay_out: Callable[[ParametersT], CourseT] = _nothing_shared
-    claims: Mapping[str, Claim] = field(default_factory=dict)  # by id, what its scenarios check
-    on_request: tuple[str, ...] = ()  # filters too slow to run where none is named
+    claims: Mapping[str, Claim] = field(default_factory=dict)  # by id
+    on_request: tuple[str, ...] = ()  # filters too slow to run unless named
 
     @property
     def usual(self) -> tuple[str, ...]:
-        """The filters that run where none is named."""
+        """Filters that run if none are named."""
         return tuple(name for name in self.filters if name not in self.on_request)
 
     def problem(self, given: ParametersT, filters: Sequence[str], seed: int) -> Problem:
-        """The scenario of these parameters with these filters, by name, ready for a campaign.
+        """Build the problem of these parameters and filters (by name) for a campaign.
 
         Raises:
             ValueError: the parameters do not fit together, or a filter or claim is not known.
@@ -295,7 +295,7 @@ class Study(Generic[ParametersT, CourseT, WorldT]):
 
 
 class PairAlignment(NamedTuple):
-    """Use of a recorded master and slave in the place of a simulation."""
+    """Transfer alignment of recorded master and slave data instead of a simulation."""
 
     study: str  # whose scenarios serve as configurations
     parameters: type[Parameters]
@@ -306,30 +306,30 @@ class PairAlignment(NamedTuple):
 class System(NamedTuple):
     """One entry of the registry."""
 
-    name: str  # as in the catalogue, which knows its summary and its scenarios
+    name: str  # as in the catalogue, which has its summary and its scenarios
     studies: Mapping[str, Study]
-    # the filter to use where nothing is known of what may go wrong; a run has it in addition to its
-    # own
+    # filter to use if nothing is known of possible faults; every run includes it in addition to
+    # its own
     default: str = ""
     replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
-    # of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, what the files
-    # do not contain, names of filters, where there are none those of the parameters, progress)
+    # replay of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, filters
+    # by name (none: those of the parameters), progress) -> outcome
     replay: Callable[..., Outcome] | None = None
-    # the same log before it is replayed, as its filters take it: (dataset, parameters) ->
-    # `replaying.Recorded`; a system without it cannot be tuned on logs
+    # the same log prepared for its filters: (dataset, parameters) -> `replaying.PreparedLog`; a
+    # system without it cannot be tuned on logs
     recorded: Callable[..., Any] | None = None
-    reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
-    # what a log is examined for: "attitude" where the sensor may lie any way in its vehicle
+    reads: Literal["dataset", "ranges"] = "dataset"  # type of its logs: `Dataset` or `RangeLog`
+    # scope of the examination of a log; "attitude": the sensor may be mounted in any orientation
     use: Literal["any", "attitude"] = "any"
-    # roles of arrays that a replay finds, of which exports are made
+    # roles of the arrays of a replay that can be exported
     replay_finds: tuple[str, ...] = ("attitude", "track")
-    # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
+    # replay parameters -> roll, pitch, yaw [rad] of the body axes relative to the sensor axes
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: PairAlignment | None = None
-    # of a system without a scenario, (replay parameters, seed) -> simulated runs that try a filter
-    # which is exported
+    # for a system without a scenario: (replay parameters, seed) -> simulated runs that test an
+    # exported filter
     aboard: Callable[[Any, int], Problem] | None = None
 
     @property
@@ -345,7 +345,7 @@ class System(NamedTuple):
 
     @property
     def claims(self) -> tuple[Mapping[str, str], ...]:
-        """Ids and texts of what scenarios check, each once: studies may share claims."""
+        """Ids and texts of all claims, each once: studies may share claims."""
         every = (item for study in self.studies.values() for item in study.claims.items())
         texts = dict.fromkeys((key, claim.text) for key, claim in every)
         return tuple({"id": key, "text": text} for key, text in texts)

@@ -1,4 +1,4 @@
-"""The instruments, or the motion, that a bank of hypotheses finds wrong: since when, how likely."""
+"""Instruments, or motion, at fault according to a bank of hypotheses: times and probabilities."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from robins.results import array
 from robins.systems.tables import SensorUpdates
 
 HELD = 0.5  # probability of being wrong above which a suspect raises an alarm
-_SHOWN = 4  # spans in a sentence
+_SHOWN = 4  # most spans listed in a sentence
 
 Wrong = Mapping[str, ArrayLike]
-"""Probability that each suspect is wrong, by its name; leading axis E epochs."""
+"""Probability that each suspect is at fault, by name; leading axis E epochs."""
 
 
 def probabilities(filter_: Filter, updates: Mapping[str, SensorUpdates]) -> dict[str, Array]:
@@ -26,7 +26,7 @@ def probabilities(filter_: Filter, updates: Mapping[str, SensorUpdates]) -> dict
 
     Args:
         filter_: with `Filter.suspects`.
-        updates: by sensor, with their notes; leading axes as you like.
+        updates: by sensor, with their notes; any leading axes.
     """
     notes = [update.notes for update in updates.values()][-1:]
     return {
@@ -37,7 +37,7 @@ def probabilities(filter_: Filter, updates: Mapping[str, SensorUpdates]) -> dict
 
 
 def spans(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
-    """First and last time of each run of epochs at which something holds.
+    """First and last time of each run of consecutive true epochs.
 
     Args:
         time_s: (E,).
@@ -47,18 +47,18 @@ def spans(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
 
 
 def edges(which: np.ndarray) -> list[tuple[int, int]]:
-    """First epoch, and the one after the last, of each run of epochs at which something holds."""
+    """First index, and one past the last, of each run of consecutive true epochs."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in change.reshape(-1, 2)]
 
 
 def tables(role: str, found: Sequence[Wrong], runs: int | None = None) -> dict[str, xr.Variable]:
-    """An array of probabilities (filter, time, suspect); nothing where no filter has a suspect.
+    """Array of probabilities (filter, time, suspect); empty if no filter has a suspect.
 
     Args:
         role: "wrong" or "mean_wrong".
-        found: by filter, in their order; NaN where a filter does not have a suspect.
-        runs: over which "mean_wrong" is the mean.
+        found: of each filter, in order; a suspect that a filter lacks gives NaN.
+        runs: number of runs that "mean_wrong" averages.
     """
     names = list(dict.fromkeys(name for of in found for name in of))
     if not names:
@@ -72,7 +72,7 @@ def tables(role: str, found: Sequence[Wrong], runs: int | None = None) -> dict[s
 
 
 def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
-    """Sentences on what a filter finds wrong in one run; none for a filter without suspects.
+    """Sentences on the faults that a filter finds in one run; none for a filter without suspects.
 
     Args:
         name: of the filter.
@@ -96,5 +96,5 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
 
 
 def words(suspect: str) -> str:
-    """A suspect in a sentence."""
+    """Name of a suspect in words."""
     return suspect.replace("_", " ")

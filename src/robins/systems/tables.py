@@ -53,7 +53,7 @@ def place_arrays(
 ) -> Variables:
     """Latitude, longitude [rad] and height [m] of a track, a reference or fixes.
 
-    `name` is their long name, where {} stands for which of the three it is.
+    `name` is their long name; {} becomes "latitude", "longitude" or "height".
     """
     made: dict[str, Any] = {}
     which = (("lat_rad", "latitude"), ("lon_rad", "longitude"), ("alt_m", "height"))
@@ -71,13 +71,13 @@ def track_arrays(places: Iterable[Geodetic], name: str = "{}") -> Variables:
 
 
 def attitude_array(q_nb: ArrayLike, frame: str, time: str = "time", words: str = "") -> Variables:
-    """Attitude of each filter (F, E, 4) as q_nb, at the times of a clock; see `results.ROLES`.
+    """Attitude q_nb of each filter (F, E, 4), along a time axis; see `results.ROLES`.
 
     Args:
-        q_nb: unit quaternions of Hamilton, scalar first.
-        frame: from which axes to which, such as "FRD to NED".
-        time: name of the clock.
-        words: its long name, if it is not that of the role.
+        q_nb: unit quaternions, Hamilton, scalar first.
+        frame: source and target axes, such as "FRD to NED".
+        time: name of the time axis.
+        words: long name, if not that of the role.
     """
     about: dict[str, Any] = {"frame": frame, "axes": ("w", "x", "y", "z"), "long_name": words}
     about["convention"] = "Hamilton, scalar first: v_n = q v_b conj(q)"
@@ -87,11 +87,11 @@ def attitude_array(q_nb: ArrayLike, frame: str, time: str = "time", words: str =
 def innovation_tables(
     seen: Sequence[Mapping[str, SensorUpdates]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> Variables:
-    """Arrays and coordinates of a solution, at the epochs of each sensor's measurements.
+    """Innovations of a solution, with coordinates, at the epochs of each sensor's measurements.
 
     Args:
-        seen: by filter and sensor, an `SensorUpdates`. A filter that has no such sensor, as a
-            smoother has none, has NaN there, and refuses nothing.
+        seen: updates by filter and sensor. A filter without a sensor (a smoother has none) has
+            NaN there, and no refusals.
         axes: by sensor, units and names of the innovation's components.
         epoch_s: (E,) time of each epoch.
     """
@@ -116,7 +116,7 @@ def innovation_tables(
 
 
 def _every(seen: Sequence[Mapping[str, SensorUpdates]], sensor: str, what: str) -> np.ndarray:
-    """Kept part of a sensor by every filter, leading axis; NaN for one without the sensor."""
+    """A field of a sensor's updates, stacked over the filters; NaN for a filter without it."""
     rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
     blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)
     return np.stack([blank if row is None else np.asarray(row, dtype=float) for row in rows])

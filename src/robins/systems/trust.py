@@ -1,6 +1,6 @@
 """User code that robins may run, and the user's confirmation of it.
 
-A file that the user names, on the command line or in a call, runs as a script of Python does. A
+A file that the user names, on the command line or in a call, runs as any Python script does. A
 file that another file names (a scenario, a campaign, the header of a record) runs only if the user
 has confirmed it. Confirmations are kept in the user's configuration folder, by path, with a digest
 of the file and of the local modules that it can import. What runs is the text that was hashed: no
@@ -33,7 +33,7 @@ _local: dict[str, tuple[Path, bytes]] = {}  # files and contents of local module
 
 
 def store() -> Path:
-    """File of the confirmations: JSON, a digest for each path."""
+    """File of the confirmations: JSON, path -> digest."""
     home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(home) / "robins" / "trusted.json"
 
@@ -48,7 +48,7 @@ def confirm(path: Path) -> None:
     now = _here[str(path)] = digest(path)
     if (known := _stored()).get(str(path)) == now:
         return
-    with contextlib.suppress(OSError):  # then it is confirmed in this process alone
+    with contextlib.suppress(OSError):  # then the confirmation holds only in this process
         store().parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         descriptor, new = tempfile.mkstemp(dir=store().parent)
         with open(descriptor, "w", encoding="utf-8") as file:
@@ -65,11 +65,11 @@ def require(path: Path, named_in: str | os.PathLike[str]) -> None:
     """Refuse to run a file named in another file unless the user has confirmed it.
 
     Args:
-        path: file of Python, or a program.
+        path: Python file, or a program.
         named_in: file, folder or address that names it, for the error.
 
     Raises:
-        RobinsError: it is not confirmed, has changed since, or is not there.
+        RobinsError: it is not confirmed, has changed since, or does not exist.
     """
     path = path.resolve()
     now, known = digest(path), _stored().get(str(path))
@@ -109,7 +109,7 @@ def digest(path: Path) -> str:
 def modules(path: Path) -> dict[str, tuple[Path, bytes]]:
     """A file and the modules of its folder that it imports, with their contents, by module name.
 
-    Imports anywhere in a file count, and of a package all files. A name that Python finds
+    Imports anywhere in a file count, and all files of a package. A name that Python finds
     elsewhere is not local.
 
     Raises:
@@ -156,7 +156,7 @@ def _imports(name: str, file: Path, content: bytes) -> Iterator[str]:
     try:
         tree = ast.parse(content) if file.suffix == ".py" else ast.Module([], [])
     except (SyntaxError, ValueError):
-        return  # importing it names the line
+        return  # importing it will report the line
     package = name.split(".") if file.name == "__init__.py" else name.split(".")[:-1]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -168,7 +168,7 @@ def _imports(name: str, file: Path, content: bytes) -> Iterator[str]:
 
 
 def elsewhere(name: str, root: Path) -> str:
-    """File of a top-level module that Python finds outside a folder; empty if there is none."""
+    """File of a top-level module that Python finds outside the folder `root`; "" if none."""
     if name in sys.stdlib_module_names:
         return f"the standard library's {name}"
     for finder in sys.meta_path:
@@ -182,7 +182,7 @@ def load(path: Path) -> ModuleType:
     """Import a file and, as it imports them, the local modules that belong to its digest.
 
     Raises:
-        RobinsError: the name of a module is that of another one.
+        RobinsError: a local module has the name of another module.
         Exception: any that the file raises.
     """
     path = path.resolve()

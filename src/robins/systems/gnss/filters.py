@@ -1,4 +1,4 @@
-"""The filters by name, what each believes, and the case that it makes of a world."""
+"""Filters by name, their assumptions, and the case that each makes of a world."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ KINDS = {
 """Model of the pseudoranges of each filter; "delays" is the default of a replay."""
 
 SMOOTHERS = {f"{name}+rts": name for name, kind in KINDS.items() if kind.memory}
-"""Smoothers of recorded logs, by name: the filter whose run each smooths."""
+"""Smoothers of recorded logs: name -> name of the filter whose run it smooths."""
 
 NAMES = (*KINDS, *SMOOTHERS)
 
 
 class GnssWorld(NamedTuple):
-    """A drive as a filter is given it; leading axis E but for the fix."""
+    """Inputs of a filter for a drive; leading axis E, except for the fix."""
 
-    fix: Any  # (4 + K,) of `first_fix`, of the first epoch
+    fix: Any  # (4 + K,) `first_fix` at the first epoch
     u: MotionStep
     y: Any  # measurements by sensor
     sky: Any  # `Sky`
@@ -50,7 +50,7 @@ class GnssWorld(NamedTuple):
 
 
 def weighing(name: str, weights: RobustWeights) -> tuple[Rule, ...]:
-    """The rules of a filter."""
+    """Robust weighting rules of a filter; none for "ls", "ekf" and other names."""
     chosen = {
         "huber": huber_weight(weights.huber),
         "student-t": student_weight(weights.dof),
@@ -81,12 +81,12 @@ def _case(
 def contender(
     believed: GnssAssumptions, place: LocalFrame, member: np.ndarray, name: str
 ) -> Contender:
-    """A filter with the model it believes in.
+    """A filter with its model.
 
     Args:
-        believed: of clock, wheels, delays and weights.
+        believed: assumptions on clock, wheels, delays and weights.
         place: origin of the state.
-        member: (N, K) as of `gnss_model`.
+        member: (N, K) as in `gnss_model`.
         name: of the filter.
 
     Raises:

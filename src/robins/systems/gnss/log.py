@@ -1,4 +1,4 @@
-"""Recorded pseudoranges and odometry: arranged by epoch, navigated, compared with the truth."""
+"""Recorded pseudoranges and odometry: arrangement by epoch, replay, comparison with the truth."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ CAUSES = (
 def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPath]:
     """Every satellite in a column of its own, every time of the receiver an epoch.
 
-    The first epoch is the first with pseudoranges of four satellites and odometry; the filter
-    starts there, and takes a first step of no length to use them.
+    The first epoch is the first with odometry and pseudoranges of four satellites; the filter
+    starts there, and uses them after a first step of zero duration.
 
     Raises:
         ValueError: no epoch has four satellites while there is odometry.
@@ -95,7 +95,7 @@ def channels_of(ranges: RangeTable, rows: np.ndarray) -> dict[str, int]:
 
 
 def recorded(log: RangeLog, parameters: GnssReplay) -> PreparedLog:
-    """The log as its filters take it, see `System.recorded`.
+    """The log prepared for its filters, see `System.recorded`.
 
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
@@ -113,10 +113,10 @@ def replay(
     """Navigate a log with the named filters, and report their quality.
 
     Args:
-        log: pseudoranges, odometry, and true places where they are known.
-        parameters: what the file does not contain.
+        log: pseudoranges, odometry, and true positions if known.
+        parameters: assumptions that the file does not contain.
         filters: names such as "delays", "huber+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current task.
 
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
@@ -172,7 +172,10 @@ def truth_at(truth: PlaceTable, place: LocalFrame, time_ns: np.ndarray) -> np.nd
 
 
 def accuracy(answer: FilterEstimates, true: np.ndarray) -> dict[str, float | int]:
-    """Horizontal and vertical errors, and the NEES of the horizontal place over its two axes."""
+    """Horizontal and vertical errors, and the mean NEES of the horizontal position per axis.
+
+    The NEES uses the two sigmas alone, without their correlation.
+    """
     error = true - np.asarray(answer.mean.position)
     known = np.all(np.isfinite(error), axis=1)
     error, sigma = error[known], np.asarray(answer.sigma)[known]

@@ -3,7 +3,7 @@ r"""Tightly coupled GNSS of a road vehicle: wheels and yaw gyro move it, pseudor
 The state is in a north-east-down frame fixed at a place o, with C = C_en there::
 
     p      position [m]
-    c      a vector (north, east): direction of travel, and how far a metre of the wheels goes
+    c      a vector (north, east): direction of travel, its length the odometer scale factor
     b      bias of the yaw gyro [rad/s]
     t, f   receiver clock [m] and its drift [m/s]
     s      clocks of the other systems against the first [m]
@@ -16,15 +16,15 @@ With speed v and yaw rate w (positive to the right) over a step h, and the turn 
 
 k is zero for a satellite that is received for the first time.
 
-c is linear where heading and scale are not, so that the start needs no heading: c is zero with a
-spread of one over the root of two along each axis. After some way, |c| = 1 is measured with the
-spread of the scale. A pseudorange of a satellite at r, with q = o + C p, is ::
+The model is linear in c, unlike in heading and scale, so the start needs no heading: c is zero with
+a sigma of 1/sqrt(2) on each axis. After some distance, |c| = 1 is measured with the sigma of the
+scale. The pseudorange of a satellite at r, with q = o + C p, is ::
 
     rho = |r - q| + w_ie (r_x q_y - r_y q_x) / light + t + s + d
 
-r being where the satellite was when it sent, in axes fixed to the Earth at that time; the second
-term is the turn of the Earth while the signal travels (Sagnac; Groves 2013, eq. 8.32, to first
-order). A signal from the east is longer: the Earth carries the receiver away from it.
+where r is the satellite's position at transmission, in the Earth-fixed axes of that time; the
+second term is the Earth's rotation while the signal travels (Sagnac; Groves 2013, eq. 8.32, to
+first order). It shortens a signal from the east, towards which the Earth carries the receiver.
 
 The clock's noise is that of Brown & Hwang (2012, sec. 9.3)::
 
@@ -53,12 +53,12 @@ from robins.systems.study import SensorAxes, StateBlock
 LIGHT = 299_792_458.0  # m/s
 RANGES, LENGTH = "pseudorange", "wheel_scale"
 POSITION = StateBlock("position", slice(0, 3), "m", "m", "NED", NED)
-_START_M = 300.0  # spread of the first fix by least squares, on each axis
-_FREE_M, _FREE_CLOCK_M = 1e3, 1e5  # what least squares knows of an epoch from the one before
+_START_M = 300.0  # sigma of the first fix by least squares, on each axis
+_FREE_M, _FREE_CLOCK_M = 1e3, 1e5  # process noise per epoch for least squares: no memory
 
 
 class GnssState(NamedTuple):
-    """The state; of a run with leading axis E."""
+    """State, or states of a run with leading axis E."""
 
     position: Any  # (3,) m, NED
     direction: Any  # (2,) north, east
@@ -69,7 +69,7 @@ class GnssState(NamedTuple):
 
 
 class MotionStep(NamedTuple):
-    """A step of the motion."""
+    """Input of a step of the motion."""
 
     dt: Any  # () s
     speed: Any  # () m/s, mean over the step, negative in reverse
@@ -84,12 +84,12 @@ class MotionStep(NamedTuple):
 class Sky(NamedTuple):
     """Inputs of the pseudoranges of an epoch, besides the state."""
 
-    satellite_e: Any  # (N, 3) m, any place where a satellite is not measured
+    satellite_e: Any  # (N, 3) m, ECEF; arbitrary where a satellite is not measured
     sigma: Any  # (N,) m
 
 
 class LocalFrame(NamedTuple):
-    """Origin of the frame of the state."""
+    """Local north-east-down frame of the state."""
 
     origin_e: Numbers  # (3,) m
     C_en: Numbers  # (3, 3)
@@ -101,43 +101,44 @@ class LocalFrame(NamedTuple):
         return cls(jnp.asarray(origin_e, float), dcm_en(lat, lon))
 
     def ecef(self, position: ArrayLike) -> Array:
-        """(..., 3) Earth-fixed, of positions north, east, down."""
+        """Earth-fixed positions (..., 3) [m] of local ones (..., 3) [m, NED]."""
         along = jnp.asarray(position) @ self.C_en.T
         return along + jnp.broadcast_to(self.origin_e, along.shape)
 
     def local(self, r_e: ArrayLike) -> Array:
-        """(..., 3) north, east, down, of Earth-fixed positions."""
+        """Local positions (..., 3) [m, NED] of Earth-fixed ones (..., 3) [m]."""
         r_e = jnp.asarray(r_e)
         return (r_e - jnp.broadcast_to(self.origin_e, r_e.shape)) @ self.C_en
 
     def geodetic(self, position: ArrayLike) -> Geodetic:
-        """Latitude, longitude and height of positions north, east, down."""
+        """Latitude, longitude and height of local positions (..., 3) [m, NED]."""
         return Geodetic.from_ecef(self.ecef(position))
 
 
 class GnssModelKind(NamedTuple):
-    """Model that a filter believes in."""
+    """Options of the model of a filter."""
 
     delays: bool = False  # a state for the delay of each satellite
-    memory: bool = True  # without it every epoch stands alone: least squares
+    memory: bool = True  # False: each epoch is independent, as in least squares
 
 
 def sagnac_m(satellite_e: Numbers, receiver_e: Numbers) -> Numbers:
-    """Contribution of the Earth's rotation to a range [m], (...) of positions (..., 3)."""
+    """Contribution (...) [m] of the Earth's rotation to a range; positions (..., 3) [m, ECEF]."""
     x, y = satellite_e[..., 0], satellite_e[..., 1]
     return OMEGA_E / LIGHT * (x * receiver_e[..., 1] - y * receiver_e[..., 0])
 
 
 def clock_density(clock: ReceiverClock) -> tuple[float, float]:
-    """Densities of the noise of clock [m/sqrt(s)] and drift [m/s/sqrt(s)]."""
+    """Noise densities of clock [m/sqrt(s)] and drift [m/s/sqrt(s)]."""
     return LIGHT * math.sqrt(clock.h0 / 2.0), LIGHT * math.pi * math.sqrt(2.0 * clock.h2)
 
 
 def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[Number, Number]:
-    """Mean and spread [m] of the delay of a signal, by its elevation and C/N0.
+    """Mean and standard deviation [m] of the delay of a signal, from its elevation and C/N0.
 
-    With P the probability that it is blocked and u = 2 a cos(e), the mean is P u, and the mean
-    square 2 P u^2, as of exponential distances.
+    With P the probability that it is blocked and u = 2 a cos(e), where a is the mean distance of
+    the walls, the mean is P u and the mean square 2 P u^2 (exponential distances), to which the
+    variance of multipath in direct sight is added.
     """
     d, xp = delays, jnp if isinstance(cn0_dbhz, jax.Array) else np
     blocked = xp.clip((d.clear_dbhz - cn0_dbhz) / (d.clear_dbhz - d.blocked_dbhz), 0.02, 0.98)
@@ -193,7 +194,7 @@ def _noise_free(numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Ar
 
 
 def pseudoranges(place: LocalFrame, member: Array, x: GnssState, sky: Sky) -> Array:
-    """(N,) what the receiver reads [m]."""
+    """Pseudoranges (N,) [m] predicted from a state."""
     q = place.ecef(x.position)
     r = jnp.sqrt(jnp.sum((sky.satellite_e - q[None, :]) ** 2, axis=-1))
     rho = r + sagnac_m(sky.satellite_e, q) + x.clock[0] + member @ x.systems
@@ -212,13 +213,13 @@ def _length(x: GnssState, aux: Array | None) -> Array:
 def gnss_model(
     believed: GnssAssumptions, kind: GnssModelKind, place: LocalFrame, member: np.ndarray
 ) -> Model:
-    """The motion and the sensors.
+    """Motion and sensors of a filter.
 
     Args:
-        believed: of clock, wheels and delays.
-        kind: which states there are.
+        believed: assumptions on clock, wheels and delays.
+        kind: options of the model.
         place: origin of the state.
-        member: (N, K) one where a satellite is of a system other than the first.
+        member: (N, K) one where satellite n belongs to the k-th system after the first.
     """
     scales = jnp.array([believed.delays.time, believed.delays.distance])
     walks = jnp.array([believed.wheels.rise, *clock_density(believed.clock)])
@@ -241,15 +242,15 @@ def start_belief(
     systems: int,
     u: MotionStep,
 ) -> Belief:
-    """Belief about the first fix; nothing is known of the heading.
+    """Initial belief from the first fix; the heading is unknown.
 
     Args:
-        believed: of clock, wheels and delays.
-        kind: which states there are.
-        fix: (5,) of `first_fix`.
+        believed: assumptions on clock, wheels and delays.
+        kind: options of the model.
+        fix: (4 + K,) of `first_fix`.
         place: origin of the state.
-        systems: how many besides the first.
-        u: the first step, for mean and spread of the delays.
+        systems: number K of systems besides the first.
+        u: the first step, for mean and sigma of the delays.
     """
     b, n = believed, len(u.delay_mean) if kind.delays else 0
     mean = GnssState(
@@ -271,16 +272,16 @@ def start_belief(
 
 
 def first_fix(y: Numbers, sky: Sky, member: Numbers, system_bias_m: Number) -> Array:
-    """(4 + K,) position [m, ECEF], clock and systems by least squares, from the Earth's centre on.
+    """Position [ECEF], clock and system clocks (4 + K,) [m] by least squares.
 
-    Gauss-Newton on the pseudoranges there are, weighed by their sigmas, as `pseudoranges` has
-    them; the clocks of the systems are zero within `system_bias_m`.
+    Gauss-Newton from the Earth's centre on the measured pseudoranges, modelled as in `pseudoranges`
+    without delays and weighted by their sigmas; the system clocks have prior mean zero.
 
     Args:
-        y: (N,) m, NaN where a satellite is not measured; four at least are.
+        y: (N,) [m], NaN where a satellite is not measured; at least four are.
         sky: of the epoch.
-        member: (N, K) as of `gnss_model`.
-        system_bias_m: spread of the clocks of the systems.
+        member: (N, K) as in `gnss_model`.
+        system_bias_m: prior sigma of the system clocks.
     """
     member = jnp.asarray(member, float)
     there = jnp.isfinite(y)
@@ -309,6 +310,6 @@ def sensor_axes(satellites: tuple[str, ...]) -> dict[str, SensorAxes]:
 
 
 def heading_rad(direction: Numbers) -> np.ndarray:
-    """(E,) heading of directions (E, 2)."""
+    """Heading (E,) [rad], clockwise from north, of directions (E, 2)."""
     c = np.asarray(direction)
     return np.arctan2(c[:, 1], c[:, 0])

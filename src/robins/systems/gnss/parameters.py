@@ -1,8 +1,8 @@
 """Parameters of tight GNSS, of a replayed log and of a simulated city, with units.
 
-What a filter believes follows from physics and published figures, not from a log: the oscillator is
-that of Brown & Hwang (2012, table 9.3, a temperature-compensated crystal), wheels and yaw gyro are
-those of a car, delays follow from the width of streets.
+The assumptions of the filters come from physics and published figures, not from a log: the
+oscillator is the temperature-compensated crystal of Brown & Hwang (2012, table 9.3), wheels and yaw
+gyro are those of a car, delays follow from the width of streets.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class ReceiverClock(Parameters):
 
     h0: Positive = 2e-19
     h2: Positive = 2e-20
-    drift: q.Speed = default("300 m/s")  # at the start: 1 ppm
-    system_bias: q.Length = default("10 m")  # of a system's clock against the first
+    drift: q.Speed = default("300 m/s")  # sigma at the start: 1 ppm
+    system_bias: q.Length = default("10 m")  # sigma of a system's clock relative to the first
 
 
 class GnssWheels(Parameters):
@@ -33,16 +33,16 @@ class GnssWheels(Parameters):
 
     scale: Annotated[float, Quantity("ratio", above="0 ppm")] = default("2 %")
     yaw_bias: q.AngleRate = default("0.2 deg/s")
-    # change of height along the road, as a random walk over the distance: after 1 m
+    # change of height along the road, a random walk over distance: sigma after 1 m
     rise: q.Length = default("0.1 m")
-    # until then the heading may be unknown, and the length of a metre is not used
+    # distance after which the heading is known and |c| = 1 is measured
     aligned_after: q.Length = default("100 m")
 
 
 class Delays(Parameters):
-    """Delays of signals that come round a corner or off a wall, one state a satellite.
+    """Delays of diffracted or reflected signals, one state per satellite.
 
-    A signal reflected by a wall at the distance a from the receiver comes late by 2 a cos(e), e
+    A signal reflected by a wall at the distance a from the receiver arrives late by 2 a cos(e), e
     being the elevation (Hsu 2018). The distance to the walls is exponential with the mean
     `reflector`; the probability that a signal is blocked falls from one to zero between two C/N0.
     """
@@ -50,8 +50,8 @@ class Delays(Parameters):
     reflector: q.Length = default("20 m")
     blocked_dbhz: Decibels = 25.0
     clear_dbhz: Decibels = 45.0
-    multipath: q.Length = default("3 m")  # spread of the delay of a signal in direct sight
-    # a delay is forgotten along the road, and more slowly at rest
+    multipath: q.Length = default("3 m")  # sigma of the delay of a signal in direct sight
+    # correlation distance of a delay, and correlation time, which matters at rest
     distance: q.Length = default("30 m")
     time: q.Duration = default("100 s")
 
@@ -63,7 +63,7 @@ class Delays(Parameters):
 
 
 class RobustWeights(Parameters):
-    """Robust weights by satellite; the usual constants of their authors."""
+    """Constants of the robust weights by satellite; defaults as usual in the literature."""
 
     huber: Positive = 1.345
     dof: Positive = 5.0
@@ -93,7 +93,7 @@ class Satellites(Parameters):
 
     count: Annotated[int, pydantic.Field(ge=6, le=64)] = 16
     lowest: Annotated[float, Quantity("angle", least="5 deg", most="60 deg")] = default("12 deg")
-    noise: q.Length = default("3 m")  # white, at 45 dBHz
+    noise: q.Length = default("3 m")  # white noise at 45 dBHz
 
 
 class Streets(Parameters):
@@ -103,13 +103,13 @@ class Streets(Parameters):
     gap: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.25  # share of blocks without a wall
     least_height: q.Length = default("8 m")
     mean_height: q.Length = default("20 m")
-    nearest: q.Length = default("8 m")  # wall to the middle of the street, log-uniform
+    nearest: q.Length = default("8 m")  # wall to mid-street, log-uniform up to `farthest`
     farthest: q.Length = default("40 m")
     loss_db: Positive = 12.0  # of a reflected signal
 
 
 class City(Scenario, GnssAssumptions):
-    """A simulated drive through streets that block and reflect."""
+    """A simulated drive through streets whose walls block and reflect signals."""
 
     system: str = "gnss"
     study: str = "city"

@@ -1,4 +1,4 @@
-"""The study "city": report of the filters, and claims."""
+"""Study "city": report of the filters, and claims."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ HORIZONTAL = "horizontal"
 
 
 def contender(city: City, course: GnssCourse, name: str) -> Contender:
-    """A filter with the model it believes in."""
+    """A filter with its model, by name."""
     return filters.contender(city, course.place, course.member, name)
 
 
 def view(city: City, course: GnssCourse) -> View:
-    """Report: the position, the true path, the track of each filter in the first run."""
+    """Report of position errors, the true path, and the track of each filter in the first run."""
     place = course.place
     p = place.geodetic(course.position)
     return View(
@@ -80,5 +80,5 @@ CLAIMS = {
     ),
 }
 
-# smoothers are named so that a campaign that requests one gets an error with their place
+# smoothers are listed so that a campaign that requests one gets an error pointing to the replay
 CITY = Study(City, filters.NAMES, world.simulate, contender, view, world.lay_out, CLAIMS)

@@ -1,9 +1,9 @@
-r"""Weights by satellite: a vector of pseudoranges, of which each component has a weight of its own.
+r"""Robust weights by satellite: each component of a vector of pseudoranges has its own weight.
 
-The rules `huber` and `student_t` of `robins.filters.rules` weigh a measurement as a whole. Here one
-reflected signal must not cost the others their weight. A component's residual is taken *after* the
-update, where the clock, which all satellites share, is known, and the update is repeated
-(iteratively reweighted least squares, started at the Kalman filter)::
+The rules `huber` and `student_t` of `robins.filters.rules` weight a measurement as a whole. Here
+one reflected signal must not reduce the weight of the others. A component's residual is taken
+*after* the update, where the clock, which all satellites share, is known, and the update is
+repeated (iteratively reweighted least squares, started at the Kalman filter)::
 
     e_i = (y - h(x+))_i / sqrt(R_ii),   w_i = w(e_i),   R_ij becomes R_ij / sqrt(w_i w_j)
 
@@ -30,11 +30,11 @@ from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import MOST, reweighted, weighed
 from robins.filters.values import Numbers, kind, number, value
 
-LEAST = 1.0 / MOST  # beyond it a component is refused
+LEAST = 1.0 / MOST  # a component with less weight is refused
 
 
 def huber_weight(k: float) -> Callable[[Array], Array]:
-    """Full weight up to k standard deviations, then a constant pull."""
+    """Huber's weight: full up to k standard deviations, then of constant influence."""
     return Partial(_huber, number("k must be a number", k))
 
 
@@ -43,7 +43,7 @@ def _huber(k: Numbers, e: Array) -> Array:
 
 
 def student_weight(dof: float) -> Callable[[Array], Array]:
-    """Weight of a residual with the tails of Student's t."""
+    """Weight of a residual distributed as Student's t with `dof` degrees of freedom."""
     return Partial(_student, number("dof must be a number", dof))
 
 
@@ -62,14 +62,14 @@ def _switch(phi: Numbers, e: Array) -> Array:
 
 @value
 class ByComponent(Rule):
-    """The rule of `by_component`: R_ij / sqrt(w_i w_j) of what the update leaves."""
+    """Rule of `by_component`: R_ij / sqrt(w_i w_j), with weights from the posterior residuals."""
 
     weight: Callable[[Array], Array]
     name: str = kind()
     iterations: int = kind()
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Noise of each component by its own weight."""
+        """Scale the noise of each component by its own weight."""
         w = reweighted(o, lambda e: jnp.maximum(self.weight(e), LEAST), self.iterations)
         given, w = weighed(o, 1.0 / w)
         there = o.present & o.accepted
@@ -81,17 +81,17 @@ class ByComponent(Rule):
 def by_component(
     weight: Callable[[Array], Array], name: str = "weights", iterations: int = 5
 ) -> Rule:
-    """The rule: the noise of each component by its own weight.
+    """Rule that scales the noise of each component by its own weight.
 
     Notes: ``name.least``, the least weight of a component present, and ``name.mean``.
 
     Args:
         weight: (m,) residuals in standard deviations -> (m,) weights in (0, inf).
         name: prefix of the notes.
-        iterations: of the weights, at least 1.
+        iterations: number of reweightings, at least 1.
 
     Raises:
-        ValueError: there is no iteration.
+        ValueError: there are fewer.
     """
     require(iterations >= 1, "weights need at least 1 iteration", iterations)
     return ByComponent(weight, name, iterations)

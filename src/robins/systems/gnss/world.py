@@ -1,11 +1,11 @@
 """A simulated drive through a city: walls in blocks, signals blocked, reflected or lost.
 
 Walls stand on both sides of the street, in blocks whose heights and distances are drawn in every
-run. With the azimuth b of a satellite against the heading, its elevation e and a wall of height H
-at the distance a on its side, the signal is blocked where a tan(e) / |sin b| < H. It then comes by
-the wall of the other side, at a', late by 2 a' |sin b| cos(e) (the image of the receiver in that
-wall), or not at all where there is none. A filter knows nothing of walls; its law of delays
-(`robins.systems.gnss.parameters.Delays`) is another, so that this world does not flatter it.
+run. With the azimuth b of a satellite relative to the heading, its elevation e and a wall of height
+H at the distance a on its side, the signal is blocked if a tan(e) / |sin b| < H. It then arrives by
+reflection at the opposite wall, at a', delayed by 2 a' |sin b| cos(e) (the image of the receiver in
+that wall), or not at all if there is none. The filters do not model walls, and their law of delays
+(`robins.systems.gnss.parameters.Delays`) differs, so that this world does not favour them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class GnssCourse(NamedTuple):
     place: LocalFrame
     member: np.ndarray  # (N, 1)
     satellites: tuple[str, ...]
-    satellite_e: np.ndarray  # (N, 3) m; they stand still: 0.5 deg in a minute counts for nothing
+    satellite_e: np.ndarray  # (N, 3) m, ECEF; fixed: their 0.5 deg per minute is negligible
     elevation_rad: np.ndarray  # (N,)
     azimuth_rad: np.ndarray  # (N,)
     position: np.ndarray  # (E, 3) m, NED
@@ -58,7 +58,7 @@ class GnssCourse(NamedTuple):
     dt: np.ndarray  # (E,) s
     speed: np.ndarray  # (E,) m/s, mean over the step
     yaw_rate: np.ndarray  # (E,) rad/s
-    way_m: np.ndarray  # (E,) along the road
+    way_m: np.ndarray  # (E,) distance along the road
 
 
 def motion_of(city: City) -> MotionProfile:
@@ -73,7 +73,7 @@ def motion_of(city: City) -> MotionProfile:
 
 
 def lay_out(city: City) -> GnssCourse:
-    """Everything that does not depend on a run.
+    """Compute all that does not depend on the run.
 
     Raises:
         ValueError: a leg is not complete.
@@ -105,7 +105,7 @@ def lay_out(city: City) -> GnssCourse:
 
 
 def _constellation(city: City, place: LocalFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Azimuth, elevation (N,) [rad] and place (N, 3) [m, ECEF], equal areas of the sky."""
+    """Azimuth, elevation (N,) [rad] and position (N, 3) [m, ECEF], uniform over the sky."""
     n, least = city.satellites.count, np.sin(city.satellites.lowest)
     up = least + (1.0 - least) * (np.arange(n) + 0.5) / n
     azimuth, elevation = (np.arange(n) * _GOLDEN) % (2.0 * np.pi), np.arcsin(up)
@@ -119,7 +119,7 @@ def _constellation(city: City, place: LocalFrame) -> tuple[np.ndarray, np.ndarra
 
 
 def signals(city: City, course: GnssCourse, key: Array) -> tuple[Array, Array]:
-    """Draw the walls; delays (E, N) [m] of the signals, NaN where one is lost, and C/N0 [dBHz]."""
+    """Draw walls; return delays (E, N) [m], NaN where a signal is lost, and C/N0 (E, N) [dBHz]."""
     s = city.streets
     count = int(course.way_m[-1] / s.block) + 1
     block = jnp.asarray((course.way_m / s.block).astype(int))
@@ -153,7 +153,7 @@ def signals(city: City, course: GnssCourse, key: Array) -> tuple[Array, Array]:
 
 
 def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWorld:
-    """One run, from its number; pure."""
+    """Simulate the run of this number; pure."""
     key = partial(stream, seed, index)
     late, cn0 = signals(city, course, key(Component.GNSS))
     e, n = late.shape
@@ -163,7 +163,7 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
     draw = jax.random.normal
     b, dt = city, jnp.asarray(course.dt)
 
-    # clock: bias and drift, walking
+    # clock: bias and drift, each a random walk
     phase, pace = clock_density(b.clock)
     begin = draw(first, (3,))
     steps = draw(oscillator, (2, e)) * jnp.sqrt(dt)[None, :]
@@ -207,7 +207,7 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
 
 
 def length_once(believed: GnssAssumptions, way_m: np.ndarray) -> np.ndarray:
-    """(E, 1) one at the epoch where the way is long enough to know the heading, NaN elsewhere."""
+    """Measurement |c| = 1 (E, 1) at the first epoch after `aligned_after` metres; NaN elsewhere."""
     out = np.full((len(way_m), 1), np.nan)
     far = np.flatnonzero(way_m >= believed.wheels.aligned_after)
     out[far[:1]] = 1.0

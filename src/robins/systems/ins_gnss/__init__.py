@@ -1,4 +1,4 @@
-"""INS/GNSS: loosely coupled, closed loop, two rates; a simulated drive and recorded logs."""
+"""Loosely coupled INS/GNSS, closed loop, two rates; a simulated drive and recorded logs."""
 
 from pathlib import Path
 

@@ -1,10 +1,10 @@
-"""A filter of INS/GNSS for a board: a problem by which it is tried, and constants of its loop in C.
+"""INS/GNSS filter for embedded use: a problem to test it, and the constants of its loop in C.
 
-What `LiveInsGnss` does around the filter is in C next to the rig `ins_gnss` of the bench:
-`navigation_blocks.h` integrates samples and cuts them into blocks, `navigation_rest.h` detects when
-the vehicle rests, `navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes
+The C counterpart of `LiveInsGnss` is next to the rig `ins_gnss` of the bench:
+`navigation_blocks.h` integrates samples and cuts them into blocks, `navigation_rest.h` detects
+standstill, `navigation_start.h` finds the start, `navigation_board.c` handles epochs, late fixes
 and the wire. A drive or a log gives the rates of samples and fixes, and the data on which the
-filter is traced and tried.
+filter is traced and tested.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from robins.systems.ins_gnss.recording import axes_of
 from robins.systems.parts import ImuBlock
 from robins.systems.study import Case, Problem
 
-_EPOCHS = 64  # of the drive or log, by which the filter is traced and tried
-_DELAY_S = 1.0  # how late a fix may be, as of `LiveInsGnss`
-_MOST_START_S = 600.0  # in which the start is sought, likewise
-_PATIENCE_S = 0.1  # for which stamps are elsewhere until they are believed, likewise
+_EPOCHS = 64  # of the drive or log, on which the filter is traced and tested
+_DELAY_S = 1.0  # largest delay of a fix, as in `LiveInsGnss`
+_MOST_START_S = 600.0  # of samples kept for the start, likewise
+_PATIENCE_S = 0.1  # duration of a jump of the stamps after which it is accepted, likewise
 _FIELDS = {
     ("predict_input", "increments_dt"): "s, of each piece of the block; 0 for none",
     ("predict_input", "increments_theta"): "rad, FRD: turn over it against the stars",
@@ -49,10 +49,10 @@ def export_sources(
     suspects: tuple[str, ...],
     label: str,
 ) -> tuple[Problem, str]:
-    """Problem by which a filter is tried that is exported, and `navigation_given.h`.
+    """Problem to test an exported filter, and the text of `navigation_given.h`.
 
     Args:
-        given: its parameters.
+        given: parameters of the filter.
         dataset: the drive or the log, with fixes.
         rates_hz: of samples and fixes.
         name: of the filter.
@@ -60,10 +60,10 @@ def export_sources(
         label: of the drive or log, for errors.
 
     Raises:
-        RobinsError: the log cannot be navigated, or the part needs what the loop does not do.
+        RobinsError: the log cannot be navigated, or the loop in C lacks a required feature.
     """
     _refuse_what_c_lacks(given, dataset)
-    # as a live filter, which has not seen the log
+    # as for a live filter, which cannot find the share from the log
     gnss = given.gnss.model_copy(update={"lasting_share": 0.0})
     given = given.model_copy(update={"gnss": gnss})
     try:
@@ -92,10 +92,10 @@ def export_sources(
 
 
 def _refuse_what_c_lacks(given: InsGnssReplay, dataset: Dataset) -> None:
-    """Refuse parameters and logs that the loop in C cannot follow.
+    """Refuse parameters and logs that the loop in C does not support.
 
     Raises:
-        RobinsError: there is such a one.
+        RobinsError: one is not supported.
     """
     g = given.gnss
     lacks = (
@@ -134,7 +134,7 @@ _SENSORS = (model.POSITION, model.VELOCITY, model.STANDSTILL, model.STILL_RATE)
 
 
 def _first_epochs(world: Case, width: int) -> Case:
-    """The first epochs of a piece, in blocks of so many pieces, with what is on the wire."""
+    """First epochs of a piece, in blocks of `width` increments, with the sensors on the wire."""
     heard = {name: world.y[name] for name in _SENSORS if name in world.y}
     about = {name: world.aux[name] for name in heard if name in world.aux}
     rows = world._replace(start=(), y=heard, aux=about)
@@ -149,7 +149,7 @@ def _first_epochs(world: Case, width: int) -> Case:
 
 
 def _wrong_to_wire(suspects: tuple[str, ...], wire: tuple[str, ...]) -> str:
-    """C that copies the probabilities of a result in the order of the wire."""
+    """C expression that copies the probabilities of a result in the order of the wire."""
     where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
     return ", ".join(f"(to)[{k}] = {where.get(one, 'NAN')}" for k, one in enumerate(wire))
 
@@ -157,7 +157,7 @@ def _wrong_to_wire(suspects: tuple[str, ...], wire: tuple[str, ...]) -> str:
 def _given_h(
     given: InsGnssReplay, rates_hz: tuple[float, float], world: Case, macros: Mapping[str, str]
 ) -> str:
-    """`navigation_given.h`: the constants of the part, and room for its memory."""
+    """Text of `navigation_given.h`: constants of the part, and sizes of its buffers."""
     g, aids, longest_s = given.gnss, given.aids, given.update.longest_block
     sample_s, fix_s = (1.0 / rate for rate in rates_hz)
     window_s = fix_s if g.velocity_window is None else g.velocity_window
@@ -165,7 +165,7 @@ def _given_h(
     epochs = math.ceil(_DELAY_S / min(longest_s, fix_s))
     defined = {
         "SAMPLE_S": sample_s,
-        "REACH_S": reach_s,  # about an epoch, in which rates are looked at
+        "REACH_S": reach_s,  # half width about an epoch over which rates are averaged
         "LONGEST_S": longest_s,
         "LONGEST_GAP_NS": f"{round(1e9 * given.update.longest_gap)}LL",
         "PATIENCE": max(3, round(_PATIENCE_S * rates_hz[0])),
@@ -185,7 +185,7 @@ def _given_h(
         "QUIET_ACCEL": aids.quiet_accel,
         "REST_WIDTH": max(2, round(aids.window / sample_s)),
         "LEVEL_WIDTH": max(2, round(2.0 * aids.window / sample_s)),
-        "WAIT_S": 1.5 * max(1.0, fix_s),  # for which a fix shows whether the vehicle moves
+        "WAIT_S": 1.5 * max(1.0, fix_s),  # validity of a fix as evidence of motion or rest
         "MOST_START_S": _MOST_START_S,
         "STEPS": math.ceil(1.1 * _MOST_START_S / sample_s),
         "FIXES": math.ceil(1.1 * _MOST_START_S / fix_s) + 64,

@@ -1,9 +1,9 @@
-"""The part of the errors of positions that lasts from fix to fix, found from a log.
+"""Time-correlated part of GNSS position errors, estimated from a log.
 
-A receiver states the sigma of a position. Where its positions scatter by far less about the motion,
-either the sigma is too large or most of the error lasts: orbits, the ionosphere, reflections, the
-receiver's own smoothing. The second is what a filter must expect, since no fix shows it: an error
-that is taken for white is averaged away on paper, and the stated sigma of the estimate with it.
+A receiver states the sigma of a position. If its positions scatter about the motion by far less,
+either the sigma is too large or most of the error is correlated from fix to fix: orbits,
+ionosphere, multipath, smoothing in the receiver. A filter must assume the latter, since the fixes
+do not show it: a filter that takes such an error for white states a sigma that is too small.
 The error of a position is then s (sqrt(share) z + sqrt(1 - share) w), with the stated sigma s,
 white w, and z first-order Gauss-Markov (Brown & Hwang 2012, ch. 4), both of unit variance.
 """
@@ -16,20 +16,20 @@ from robins.earth import curvature_radii
 from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.recording import Log
 
-LEAST = 0.3  # share of the variance from which on it is taken to last; less may be chance
-MOST = 0.99  # the rest is white, however small the scatter
-_FEWEST = 100  # differences that scatter is estimated from, in each axis
-# of absolute values; the smaller ones are those of a receiver at rest
+LEAST = 0.3  # least share of the variance taken as correlated; less may be chance
+MOST = 0.99  # largest share, however small the scatter; the rest is white
+_FEWEST = 100  # differences on each axis from which scatter is estimated
+# quantile of absolute values (and of a unit normal); smaller ones may be from rest
 _QUANTILE, _NORMAL = 0.8, 1.2816
-_THIRD = np.sqrt(20.0)  # sigma of a third difference of white noise, over its own
+_THIRD = np.sqrt(20.0)  # sigma of the third difference of unit white noise
 
 
 def scatter(log: Log) -> np.ndarray | None:
-    """Scatter (3,) of positions about the motion over their sigmas, north, east, down.
+    """Scatter (3,) of positions about the motion, in their sigmas; north, east, down.
 
-    Third differences of positions, or differences less what velocities say where these are known,
-    whichever scatter less: a bound from above, as both contain some motion. None where there are
-    too few fixes at even intervals.
+    From third differences of positions, or, if velocities are known, from differences minus the
+    integrated velocity, whichever scatter less. This is an upper bound, as both contain some
+    motion. None if there are too few fixes at even intervals.
     """
     g = log.gnss
     place = np.stack([g.lat_rad, g.lon_rad, g.alt_m], -1)
@@ -54,17 +54,17 @@ def scatter(log: Log) -> np.ndarray | None:
 
 
 def _spread(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Sigma (3,) of normal values by a quantile; NaN where too few are finite."""
+    """Sigma (3,) of normal values, from a quantile; NaN if too few are finite."""
     out = np.full(3, np.nan)
     for k, column in enumerate(values.T):
         finite = column[chosen & np.isfinite(column)]
-        if len(finite) >= _FEWEST:  # the median: velocities may be those of the fix before
+        if len(finite) >= _FEWEST:  # minus the median: velocities may lag by a fix
             out[k] = np.quantile(np.abs(finite - np.median(finite)), _QUANTILE) / _NORMAL
     return out
 
 
 def with_correlated_share(parameters: InsGnssReplay, log: Log) -> tuple[InsGnssReplay, list[str]]:
-    """The parameters with the share that lasts, and a note where it was found from the log."""
+    """Parameters with `gnss.lasting_share` set, and a note if it was estimated from the log."""
     if parameters.gnss.lasting_share is not None:
         return parameters, []
     found = scatter(log)

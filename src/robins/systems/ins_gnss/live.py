@@ -1,23 +1,21 @@
-"""Navigation while the vehicle moves: samples and fixes in as they come, the state out at once.
+"""Live navigation: samples and fixes are processed as they arrive, each answered at once.
 
-`LiveInsGnss` is a causal filter of a replay, by the same code, epoch after epoch. What a replay has
-at once and a live object has not:
+`LiveInsGnss` is a causal filter of a replay, by the same code, epoch by epoch. Differences from a
+replay, which has the whole log:
 
-- **Late fixes.** The state of the filter at each epoch of the last `longest_delay_s` is kept. A fix
-  whose time has passed is used at its own time: the filter goes back to the epoch before it and
-  takes the samples and fixes since then again, so that the order of arrival changes nothing; one of
-  before the start, as late as that, may change the start. An older one is refused
-  (`gnss_too_old`), one of the same time as another too (`gnss_duplicate`); one that is newer than
-  the newest sample waits.
-- **A look ahead of 10 ms**, or one and a half samples where these are rarer. The turn rate at an
-  epoch is a mean about it, and the increment before the last sample is known with the next one. So
-  the filter is that much behind, and the answer to a sample is its state carried on over what came
-  since, exactly what it predicts; the last increment is made of the samples so far.
+- **Late fixes.** The state of the filter at each epoch of the last `longest_delay_s` is kept. A
+  late fix is used at its own time: the filter goes back to the epoch before it and repeats the
+  steps since, so that the order of arrival makes no difference; one from before the start, within
+  that delay, may change the start. An older fix is refused (`gnss_too_old`), and so is a second one
+  of the same time (`gnss_duplicate`); one newer than the newest sample waits.
+- **A latency of 10 ms**, or 1.5 sampling intervals if longer. The turn rate at an epoch is a mean
+  about it, and an increment is final only with the next sample. The filter lags by that much, and
+  the answer to a sample is its state predicted to that sample; the last increment is provisional.
 - **The start.** With a given heading the filter waits for rest, at most ten seconds from the first
-  whole fix on. A magnetometer is asked where for 30 s no fix was fast enough; a replay asks it
-  where none of the log is. Answers before are `STARTING`, without numbers.
-- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at.
-- Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
+  complete fix on. A magnetometer is used if no fix was fast enough for 30 s; a replay uses it if no
+  fix of the log is. Answers before the start are `STARTING`, without numbers.
+- A gap longer than `update.longest_gap` restarts the object. `outages` are ignored.
+- The rates of samples and fixes, which a replay finds from the log, are given to the constructor.
 """
 
 from __future__ import annotations
@@ -52,7 +50,7 @@ from robins.systems.streaming import Flag, Live, LiveError, TimestampGate, numbe
 from robins.systems.study import Case
 
 _PATIENCE_S = 0.1
-_WIDTH = 19  # of the vector: attitude, velocity, place and nine sigmas
+_WIDTH = 19  # of the vector: attitude, velocity, position and nine sigmas
 
 
 class MeasurementOutcome(NamedTuple):
@@ -64,7 +62,7 @@ class MeasurementOutcome(NamedTuple):
 
 
 class Navigation(NamedTuple):
-    """The answer to a sample or a fix: the state of the IMU; NaN while `STARTING`."""
+    """Answer to a sample or a fix: the state at the IMU; NaN while `STARTING`."""
 
     time_ns: int
     q_nb: np.ndarray  # (4,) forward-right-down to north-east-down, scalar first
@@ -74,13 +72,13 @@ class Navigation(NamedTuple):
     alt_m: float
     sigma: np.ndarray  # (9,) attitude [rad], velocity [m/s], position [m], each NED
     flags: Flag
-    # probability that each suspect of a bank is wrong, after the last fix or standstill
+    # probability that each suspect of a bank is at fault, after the last fix or standstill
     wrong: Mapping[str, float] = {}
     seen: Mapping[str, MeasurementOutcome] = {}  # by sensor, in the last step of the filter
 
 
 def predicted(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
-    """Mean and standard deviations after a block, in one vector."""
+    """Predicted mean and standard deviations after a block, as one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
@@ -92,7 +90,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 
 def kept(step: Step) -> jax.Array:
-    """The same after what was measured, what became of that, and what a bank finds wrong."""
+    """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
     last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
     seen = [
         jnp.stack([jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)])
@@ -108,13 +106,13 @@ def answer_of(
     sensors: Sequence[str] = (),
     suspects: Sequence[str] = (),
 ) -> Navigation:
-    """The answer that a vector of `predicted` or `kept` is.
+    """Unpack a vector of `predicted` or `kept` into an answer.
 
     Args:
-        time_ns: its stamp.
+        time_ns: stamp of the answer.
         x: the vector.
         flags: of the answer.
-        sensors: of `kept`, by name in their order there.
+        sensors: names of those in a vector of `kept`, in order.
         suspects: of a bank.
     """
     lat, lon, alt = x[7:10].tolist()
@@ -128,7 +126,7 @@ def answer_of(
 
 
 def outliers_of(answer: Navigation) -> list[str]:
-    """Sensors whose measurement a filter refused, or a bank took for wrong, in its last step."""
+    """Sensors whose measurement a filter refused, or a bank took for faulty, in its last step."""
     return [
         name
         for name, one in answer.seen.items()
@@ -137,15 +135,15 @@ def outliers_of(answer: Navigation) -> list[str]:
 
 
 class LiveInsGnss(Live):
-    """The state of a vehicle at each sample, at once (see the module for what differs).
+    """Live navigation state at each sample (the module lists differences from a replay).
 
     Attributes:
-        counts: `imu_...` and `gnss_...`, refused by reason; `begun_anew`, `imu_gaps_declared`,
+        counts: `imu_...` and `gnss_...`, refused ones by reason; `begun_anew`, `imu_gaps_declared`,
             `blocks_over_imu_gaps`, `steps_again` (blocks repeated for late fixes); `outliers_...`
             by sensor, measurements that the filter refused (`Flag.OUTLIER`).
-        start: the sentence on how the start was found; "" before.
-        epoch: what the filter itself said last, with the fixes up to then; None before.
-        passed: the same of each epoch that the last sample or fix brought, in order.
+        start: sentence on how the start was found; "" before.
+        epoch: answer at the last step of the filter, with the fixes up to then; None before.
+        passed: such answers of all steps made by the last sample or fix, in order.
     """
 
     _parameters: ClassVar[type[Any]] = InsGnssReplay
@@ -163,20 +161,20 @@ class LiveInsGnss(Live):
         longest_delay_s: float = 1.0,
         machine: str | None = None,
     ):
-        """Begin; programs are made before the first sample.
+        """Create the object, and build its programs before the first sample.
 
         Args:
-            parameters: as of a replay; the lever arm is `gnss.lever_arm`.
+            parameters: as for a replay; the lever arm is `gnss.lever_arm`.
             rate_hz: of the samples.
             fix_rate_hz: of the receiver.
-            filter: a causal one of the replays.
-            longest_delay_s: how late a fix may come.
-            machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
-                Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.
+            filter: name of a causal filter of replays.
+            longest_delay_s: largest delay of a fix.
+            machine: machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
+                Programs of "vm" are kept in the user's cache; "c" needs minutes to compile once.
 
         Raises:
-            ValueError: a rate or delay is not positive, or there is no such machine or no causal
-                filter of this name.
+            ValueError: a rate or delay is not positive, `update.longest_gap` is too short for the
+                rate, or there is no such machine or no causal filter of this name.
         """
         positive = {"rate_hz": rate_hz, "fix_rate_hz": fix_rate_hz}
         for what, value in {**positive, "longest_delay_s": longest_delay_s}.items():
@@ -200,17 +198,17 @@ class LiveInsGnss(Live):
         self._compile()
 
     def start_over(self) -> None:
-        """Be as new: without samples, fixes and counts."""
+        """Reset the object: discard samples, fixes, state and counts."""
         self._door = TimestampGate(self.parameters.update.longest_gap, self._patience)
         self.counts.clear()
         self._restart()
 
     def _restart(self) -> None:
-        """Forget all but the counts and the stamps."""
+        """Reset all but the counts and the stamps."""
         self._path = InsGnssPath(self.parameters, self._usual, self._delay_s)
-        self._past: list[Any] = []  # epochs of the longest delay, as `InsGnssPath.due` has them
-        self._states: list[Any] = []  # of the filter at them
-        self._counted: list[Any] = []  # by epoch, what was counted there
+        self._past: list[Any] = []  # epochs within the longest delay, as from `InsGnssPath.due`
+        self._states: list[Any] = []  # states of the filter at these
+        self._counted: list[Any] = []  # names counted at these
         self._last_step: Any = None  # stamp, vector and sensors of the last step
         self.start, self._begun_s, self.epoch = "", math.nan, None
         self.passed: list[Navigation] = []
@@ -219,17 +217,17 @@ class LiveInsGnss(Live):
     def push_imu(
         self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None
     ) -> Navigation:
-        """Take an inertial sample; the state at its stamp.
+        """Process an inertial sample; return the state at its stamp.
 
         Args:
-            time_ns: stamp, whole nanoseconds, of the clock that fixes have too.
-            gyro_rad_s: (3,) rate along the axes of the sensor; NaN is missing.
+            time_ns: stamp, integer nanoseconds, on the same clock as those of fixes.
+            gyro_rad_s: (3,) rate along the axes of the sensor; NaN if missing.
             accel_m_s2: (3,) specific force.
-            field_t: (3,) T of a magnetometer, for the start alone.
+            field_t: (3,) T of a magnetometer, used for the start only.
 
         Raises:
-            LiveError: a stamp or vector of another kind, or numbers that are those of another unit;
-                the object goes on with the next sample.
+            LiveError: a malformed stamp or vector, or values of another unit; the object continues
+                with the next sample.
         """
         self.passed, time = [], stamp(time_ns)
         values = np.stack([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
@@ -262,21 +260,21 @@ class LiveInsGnss(Live):
         sigma_v: Any = None,
         quality: int = 0,
     ) -> Navigation:
-        """Take a fix, late or not; the state at the newest sample.
+        """Process a fix, late or not; return the state at the newest sample.
 
         Args:
-            time_ns: when it was true (`gnss.latency` later), whole nanoseconds.
-            lat_rad: of the antenna, NaN where missing, and
-            lon_rad: likewise, and
-            alt_m: above the ellipsoid.
+            time_ns: stamp, integer nanoseconds: time of validity plus `gnss.latency`.
+            lat_rad: latitude of the antenna; NaN if missing.
+            lon_rad: its longitude; NaN if missing.
+            alt_m: its height above the ellipsoid; NaN if missing.
             sigma_m: (3,) m, north, east, down.
             v_n: (3,) m/s, north, east, down, or None.
-            sigma_v: (3,) m/s, with a velocity.
-            quality: of RTKLIB, 0 unknown.
+            sigma_v: (3,) m/s, required with a velocity.
+            quality: RTKLIB quality, 0 if unknown.
 
         Raises:
-            LiveError: a stamp or number of another kind, or angles that are those of another unit;
-                the object goes on.
+            LiveError: a malformed stamp or number, or angles in another unit; the object remains
+                usable.
         """
         self.passed, time = [], stamp(time_ns)
         place = lat_rad, lon_rad, alt_m
@@ -284,12 +282,12 @@ class LiveInsGnss(Live):
         oldest_s, is_first = -math.inf, False
         if self._past:
             oldest_s, is_first = self._past[0][0], self._past[0][0] == self._begun_s
-        if is_first:  # the start itself may have been another with this fix
+        if is_first:  # this fix may change the start itself
             newest_s = self._path.seconds(int(self._path.time_ns[-1]))
             oldest_s = min(oldest_s, newest_s - self._delay_s)
         if why := self._path.refused(row, oldest_s):
             self.counts[f"gnss_{why}"] += 1
-        if why and not (why == "nan" and self._online is not None):  # which is an epoch then
+        if why and not (why == "nan" and self._online is not None):  # an empty fix is an epoch
             return self._answer(int([time, *self._path.time_ns][-1]), Flag.REFUSED)
         self._path.push_fix(row)
         if is_first and row[0] <= self._begun_s:
@@ -300,7 +298,7 @@ class LiveInsGnss(Live):
         return self._answer(int(self._path.time_ns[-1]), Flag.REFUSED if why else Flag(0))
 
     def _advance(self) -> None:
-        """Take all steps that can be taken."""
+        """Make all filter steps that the samples allow."""
         if self._online is None and not self._begin():
             return
         at_s, wanted_s = self._past[-1]
@@ -312,7 +310,7 @@ class LiveInsGnss(Live):
         self._forget()
 
     def _begin(self) -> bool:
-        """Begin the filter, once the start is known."""
+        """Start the filter once the start is known; True if it runs."""
         try:
             found = self._path.start()
         except LiveError:
@@ -328,7 +326,7 @@ class LiveInsGnss(Live):
         return True
 
     def _step(self, epoch: tuple[float, float], u: ImuBlock, y: PyTree, aux: PyTree) -> None:
-        """Take a step of the filter, to an epoch, with what was measured there."""
+        """Step the filter to an epoch, with the measurements there."""
         assert self._online is not None
         found = np.asarray(self._online.step(y, u, aux, keep=kept))
         time_ns = round(epoch[0] * 1e9) + self._path.origin_ns
@@ -349,16 +347,16 @@ class LiveInsGnss(Live):
         return answer._replace(flags=Flag.OUTLIER if outliers_of(answer) else Flag(0))
 
     def _forget(self) -> None:
-        """Drop what is older than the longest delay, in large pieces."""
+        """Drop states and samples older than the longest delay."""
         now = self._past[-1][0]
         first = next(k for k, e in enumerate(self._past) if e[0] >= now - self._delay_s)
-        # one epoch before it is where a fix of that age is counted from
+        # a fix of that age starts from the epoch before it
         keep = max(first - 1, 0)
         del self._past[:keep], self._states[:keep], self._counted[:keep]
         self._path.forget(self._past[0][0])
 
     def _go_back(self, time_s: float) -> None:
-        """Return to the last epoch before a fix was known."""
+        """Return to the last epoch that a fix at this time does not change."""
         if not self._past or time_s > self._past[-1][0] + self._path.reach_s:
             return
         longest_s, keep = self.parameters.update.longest_block, 1
@@ -369,12 +367,12 @@ class LiveInsGnss(Live):
         self._go_back_to(keep)
 
     def _go_back_to(self, keep: int) -> None:
-        """Return to the last of so many epochs, or of none to before the start."""
+        """Return to the last of the first `keep` epochs, or to before the start if 0."""
         if keep == len(self._past):
             return
         self.counts["steps_again"] += len(self._past) - max(keep, 1)
         self.counts.subtract(chain(*self._counted[keep:]))
-        self.counts = +self.counts  # without what was counted in these alone
+        self.counts = +self.counts  # drop counts that fell to zero
         del self._past[keep:], self._states[keep:], self._counted[keep:]
         assert self._online is not None
         if keep:
@@ -397,7 +395,7 @@ class LiveInsGnss(Live):
         return answer._replace(wrong=self.epoch.wrong, seen=self.epoch.seen, flags=flags)
 
     def _compile(self) -> None:
-        """Have all compiled by a standstill that is thrown away."""
+        """Compile all programs by running through a standstill, which is discarded."""
         step = round(1e9 * self._usual.sample_s)
         attitudes(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
         second, ones = max(1, round(1e9 / step)), np.ones(3)

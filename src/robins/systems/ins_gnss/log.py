@@ -1,7 +1,7 @@
-"""Recorded logs: one clock, an alignment, epochs with their measurements, and what a replay found.
+"""Replay of recorded logs: common clock, alignment, epochs with their measurements, outcome.
 
-Two rates: every IMU sample is mechanised, the covariance moves once a block. A gap in the IMU that
-is too long to bridge ends a piece of the log; the next piece is aligned anew.
+Two rates: every IMU sample is mechanised, the covariance is propagated once per block. An IMU gap
+too long to bridge ends a piece of the log; the next piece is aligned again.
 """
 
 from __future__ import annotations
@@ -77,26 +77,26 @@ CAUSES = (
     "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
     "tells some of them."
 )
-WHEELS_S = 0.5  # between two rows of the odometry within which the speed is interpolated
-UNSURE_S = 2.0  # longer than this, a doubt is told
+WHEELS_S = 0.5  # longest interval of odometry over which the speed is interpolated
+UNSURE_S = 2.0  # shortest doubt that is reported
 ROBUST, WEIGHED = "robust", "weighed"
 SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
 NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
-"""Filters and smoothers of recorded logs; the first is what a log gets that nobody tuned it for."""
+"""Filters and smoothers of recorded logs; the first is for logs without tuned parameters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogSegment(LogPiece):
-    """A piece of a log that is navigated; its world is a `Case`."""
+    """A piece of a log to navigate; its world is a `Case`."""
 
     start: StartPoint
     rate_b: np.ndarray  # (E, 3) rad/s mean raw gyro rate about each epoch
-    used: np.ndarray  # (M,) bool, fixes of the log that fall on an epoch of the piece
+    used: np.ndarray  # (M,) bool, fixes of the log at an epoch of the piece
     withheld: np.ndarray  # (E,) bool
 
 
 def prepare(whole: Log, parameters: InsGnssReplay, rows: slice) -> LogSegment:
-    """Align on a piece of a log, place the epochs and sort the measurements to them.
+    """Align on a piece of a log, set its epochs and assign the measurements to them.
 
     Raises:
         ValueError: no start can be found, or no fix lies in the piece.
@@ -109,7 +109,7 @@ def prepare(whole: Log, parameters: InsGnssReplay, rows: slice) -> LogSegment:
     used = (log.gnss_s > begin_s) & (log.gnss_s <= end_s)
     if not np.any(used):
         raise ValueError(f"no GNSS fix after the start at {begin_s:.1f} s")
-    # a filter that runs while the log is made does not know when the next fix comes
+    # uneven: a live filter does not know in advance when the next fix comes
     longest_s = parameters.update.longest_block
     epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
     steps = steps_of(log, used, begin_s, epochs, parameters, usual)
@@ -142,9 +142,9 @@ def steps_of(
     parameters: InsGnssReplay,
     usual: UsualIntervals,
 ) -> InsGnssSteps:
-    """Steps from epoch to epoch, with what was measured at their ends.
+    """Steps from epoch to epoch, with the measurements at their ends.
 
-    A piece of a log that reaches back far enough has the bits of the whole log.
+    A piece of a log that reaches back far enough gives the same bits as the whole log.
 
     Args:
         log: increments and fixes.
@@ -172,7 +172,7 @@ def blocks_of(
     usual: UsualIntervals,
     spare: int = 0,
 ) -> ImuBlock:
-    """Blocks from epoch to epoch, with room for what the longest holds and so many more."""
+    """Blocks from epoch to epoch, as wide as the longest block, plus `spare` increments."""
     p = parameters.update
     width = usual_width(p.longest_block, usual.sample_s) + spare
     blocks = cut(increments, time_s, begin_s, epochs, least=width)
@@ -181,7 +181,7 @@ def blocks_of(
 
 
 def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Belief:
-    """Belief at the first fix, moved from the antenna to the IMU."""
+    """Initial belief at the first fix, reduced from the antenna to the IMU."""
     g, row = log.gnss, start.fix
     antenna = Geodetic(*(np.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
 
@@ -206,9 +206,9 @@ def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Beli
     if start.spread is None:
         return belief
     factor, each = np.array(belief.factor), np.linalg.cholesky(start.spread)
-    for k in range(3):  # velocity and position of one axis stand three places apart
+    for k in range(3):  # indices of velocity and position of an axis differ by three
         factor[3 + k, 3 + k] = each[k, 0, 0]
-        if not parameters.gnss.lasting_share:  # else the mean of fixes is as far off as one of them
+        if not parameters.gnss.lasting_share:  # else averaging fixes does not reduce the error
             factor[6 + k, 3 + k : 9 : 3] = each[k, 1]
     return belief._replace(factor=factor)
 
@@ -216,7 +216,7 @@ def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Beli
 def measured_fixes(
     log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float
 ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
-    """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
+    """GNSS measurements and their aux by epoch; NaN where there is no fix or it is withheld."""
     given, g = used & ~log.withheld, log.gnss
     at = np.searchsorted(epochs, log.gnss_s[given] - 1e-9)
 
@@ -239,7 +239,7 @@ def measured_fixes(
 def measured_rest(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: UsualIntervals
 ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
-    """Measurements of what is known without a receiver: standing still, or not slipping."""
+    """Measurements without a receiver, with their aux: standstill, no slip, odometer."""
     still, mean_rate = at_rest(log, aids, usual, epochs)
     stands = still[:, None]
     y: dict[str, Any] = {}
@@ -259,7 +259,7 @@ def measured_rest(
 
 
 def bank_step_s(parameters: InsGnssReplay, fix_step_s: float) -> float:
-    """Length of most steps."""
+    """Usual duration of a step [s]."""
     return min(fix_step_s, parameters.update.longest_block)
 
 
@@ -267,11 +267,11 @@ _case = cache(partial)
 
 
 def contender(parameters: InsGnssReplay, fix_step_s: float, name: str) -> Contender:
-    """A filter with the model it believes in.
+    """A filter with its model.
 
     Args:
         parameters: of the replay.
-        fix_step_s: between fixes, in the median.
+        fix_step_s: median interval of fixes [s].
         name: of a filter, or `WEIGHED`.
     """
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
@@ -299,10 +299,10 @@ def _answers(
     wanted: Sequence[str],
     progress: Progress,
 ) -> tuple[dict[str, FilterEstimates], list[str], list[str]]:
-    """Answers of each filter and smoother, notes and warnings of the bank.
+    """Estimates of each filter and smoother, and notes and warnings of the bank.
 
-    The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
-    see positions that were off, and has the bank's process noise.
+    The smoother has a single hypothesis, the likeliest by the bank's smoothed probabilities: it
+    omits positions that were off, and uses the bank's process noise.
     """
     made = partial(contender, parameters, fix_step_s)
     navigated = partial(
@@ -331,7 +331,7 @@ def _answers(
 
 
 def _settled(piece: LogSegment, verdict: HindsightVerdict) -> LogSegment:
-    """The piece without the positions that were off, with the process noise that it had."""
+    """The piece without the positions that were off, with process noise scaled by the verdict."""
     world: Case = piece.world
     off = verdict.off > 0.5
     position = jax.tree_util.tree_map(lambda x: np.where(off, np.nan, x), world.y[model.POSITION])
@@ -340,7 +340,7 @@ def _settled(piece: LogSegment, verdict: HindsightVerdict) -> LogSegment:
 
 
 def _doubts(piece: LogSegment, probability: np.ndarray, verdict: HindsightVerdict) -> list[str]:
-    """Sentences on where positions were off, and on where that could not be told in time."""
+    """Sentences on times at which positions were off, or at which that remained undecided."""
     seen = np.isfinite(np.asarray(piece.world.y[model.POSITION].lat))
     sentences = []
     if off := spans(piece.epoch_s[seen], verdict.off[seen] > 0.5):
@@ -366,7 +366,7 @@ def _doubts(piece: LogSegment, probability: np.ndarray, verdict: HindsightVerdic
 
 
 def _share_note(answer: FilterEstimates, parameters: InsGnssReplay, fix_step_s: float) -> list[str]:
-    """A sentence on what the velocities are, where the configuration does not say."""
+    """Sentence on the window of the velocities, if it was estimated and not configured."""
     wide = answer.mean
     if wide.share is None or model.VELOCITY not in answer.updates:
         return []
@@ -404,10 +404,10 @@ def _opened(dataset: Dataset, parameters: InsGnssReplay) -> _Opened:
 
 
 def recorded(dataset: Dataset, parameters: InsGnssReplay) -> PreparedLog:
-    """The log as its filters take it, as `System.recorded` says.
+    """The log prepared for its filters, see `System.recorded`.
 
     Raises:
-        ValueError: the log cannot be navigated; the sentence says why and what to do.
+        ValueError: the log cannot be navigated; the message gives the reason and a fix.
     """
     parameters, _, pieces, _, interval_s, _ = _opened(dataset, parameters)
     return PreparedLog(pieces, partial(contender, parameters, interval_s))
@@ -419,13 +419,13 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = ignore_progress,
 ) -> Outcome:
-    """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
+    """Navigate an examined and cleaned log of IMU and GNSS, see `System.replay`.
 
-    Samples that were loaded without a mounting are turned as the parameters say; `InsGnssReplay()`
-    is what the command takes without a file.
+    Samples loaded without a mounting are rotated by `imu.orientation`; `InsGnssReplay()` is the
+    default configuration of the command.
 
     Raises:
-        ValueError: the log cannot be navigated; the sentence says why and what to do.
+        ValueError: the log cannot be navigated; the message gives the reason and a fix.
     """
     parameters, log, pieces, problems, interval_s, notes = _opened(dataset, parameters)
     wanted = filters or parameters.filters

@@ -47,7 +47,7 @@ POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "non_holonomic",
 )
 ODOMETER = "odometer"
-IMU = "imu"  # drives the motion; a bank may find it wrong
+IMU = "imu"  # drives the motion; a bank may find it at fault
 SENSORS = {
     POSITION: SensorAxes("m", "NED", NED),
     VELOCITY: SensorAxes("m/s", "NED", NED),
@@ -59,7 +59,7 @@ SENSORS = {
 
 
 def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
-    """The tangent components of `InsState` under their names."""
+    """Named blocks of the tangent components of `InsState`."""
     blocks = (
         StateBlock("attitude", slice(0, 3), "rad", "deg", "NED", NED),
         StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", NED),
@@ -80,7 +80,7 @@ class Fix(NamedTuple):
 
 
 class Wheel(NamedTuple):
-    """Inputs of a speed of the wheels besides the state."""
+    """Inputs of a wheel speed besides the state."""
 
     sigma: ArrayLike  # (1,) m/s
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the time
@@ -89,21 +89,21 @@ class Wheel(NamedTuple):
 class Velocity(NamedTuple):
     """Inputs of a GNSS velocity besides the state.
 
-    A receiver that differences positions states the mean velocity over a window up to the fix. It
-    is older than the fix by what the vehicle gained since, on average over the window.
+    A receiver that differences positions states the mean velocity over a window up to the fix,
+    which differs from that at the fix by the mean velocity gained since.
     """
 
     sigma: ArrayLike  # (3,) m/s, north east down
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
-    gained_b: ArrayLike = 0.0  # (3,) m/s, raw, in body axes at the fix
+    gained_b: ArrayLike = 0.0  # (3,) m/s, mean raw gain, in body axes at the fix
     age_s: ArrayLike = 0.0  # s, mean age over the window: half its length
 
 
 class Mount(NamedTuple):
-    """Places of antenna and axle on the vehicle, and the latency of fixes."""
+    """Lever arms of antenna and axle, and the latency of fixes."""
 
     lever_b: Array  # (3,) m, IMU to antenna, body axes
-    latency_s: Array  # () s, a fix stamped t is of t - latency
+    latency_s: Array  # () s, a fix stamped t is valid at t - latency
     axle_b: Array  # (3,) m, IMU to the point that cannot slip sideways
 
 
@@ -117,12 +117,12 @@ def _step_linear(noise: InsNoise, x: InsState, block: ImuBlock):
 
 
 def turn_rate_b(x: InsState, omega_b: Array) -> Array:
-    """Turn rate of the body against the Earth [rad/s, body] from a raw gyro rate."""
+    """Turn rate of the body relative to the Earth [rad/s, body] from a raw gyro rate."""
     return omega_b - x.gyro_bias - x.q_nb.inverse().apply(earth_rate_n(x.position.lat))
 
 
 def antenna_velocity(x: InsState, mount: Mount, omega_b: Array) -> Array:
-    """Velocity of the antenna [m/s, NED]: the IMU's plus that of turning about it."""
+    """Velocity of the antenna [m/s, NED]: that of the IMU plus the lever-arm velocity."""
     return x.v_n + x.q_nb.apply(jnp.cross(turn_rate_b(x, omega_b), mount.lever_b))
 
 
@@ -169,7 +169,8 @@ def _read_wheel(mount: Mount, x: InsState, wheel: Wheel):
 def noise_of(imu: InsGnssImu) -> InsNoise:
     """Noise of the inertial sensors, SI.
 
-    A Gauss-Markov bias of spread s and time tau is driven by noise of density s sqrt(2 / tau).
+    A Gauss-Markov bias of sigma s and time constant tau is driven by noise of density
+    s sqrt(2 / tau).
     """
 
     def drive(walk, spread, time):
@@ -190,7 +191,7 @@ def noise_of(imu: InsGnssImu) -> InsNoise:
 
 
 def mount_of(gnss: Gnss, aids: Aids) -> Mount:
-    """Lever arms and latency."""
+    """Lever arms and latency of the parameters."""
     return Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
 
 
@@ -200,15 +201,14 @@ def ins_gnss_model(imu: InsGnssImu, gnss: Gnss, aids: Aids) -> Model:
     Args:
         imu: the inertial sensors as a filter models them.
         gnss: lever arm and latency.
-        aids: how still a vehicle at rest is, how little it slips on a road, and where its axle is.
+        aids: sigmas of standstill and slip, and the lever arm of the axle.
 
     Returns:
         A model with sensors, in order: "gnss_position" (a `Geodetic`, aux `Fix`),
         "gnss_velocity" ((3,) NED, aux `Velocity`), "zero_velocity" ((3,), zeros), "zero_rate" ((3,)
         mean gyro rate at rest), "non_holonomic" ((2,) zeros; aux mean gyro rate) and "odometer"
-        ((1,), aux `Wheel`). A sensor is
-        silent at an epoch where its measurement is NaN, and left out of a run that does not name
-        it.
+        ((1,), aux `Wheel`). A NaN
+        measurement is missing; a run without a sensor's name omits that sensor.
     """
     noise, mount = noise_of(imu), mount_of(gnss, aids)
     still, still_rate = aids.standstill_velocity, aids.standstill_rate
@@ -234,11 +234,11 @@ def start_belief(
     gyro_bias: ArrayLike | None = None,
     fix_sigma_m: Iterable[Number] = (0.0, 0.0, 0.0),
 ) -> Belief:
-    """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
+    """Initial belief about `InsState`, without correlations.
 
-    Sigmas are of `imu` and `start`, of roll and pitch `tilt_rad`, of the heading `heading_rad`; to
-    that of the position is added `fix_sigma_m` (3,) of the fix that it is taken from.
-    `gyro_bias` (3,) rad/s is given where it is known from rest; else it is zero.
+    Sigmas are `tilt_rad` for roll and pitch, `heading_rad` for heading, else those of `imu` and
+    `start`; `fix_sigma_m` (3,), of the fix that gives the position, is added in quadrature.
+    `gyro_bias` (3,) [rad/s] is the mean if known from rest; else zero.
     """
     place = [(start.position**2 + s**2) ** 0.5 for s in fix_sigma_m]
     sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, place]
@@ -248,6 +248,6 @@ def start_belief(
     if gyro_bias is not None:
         mean = mean._replace(gyro_bias=jnp.asarray(gyro_bias))
     each = as_array([x for part in sigma for x in part])
-    # numbers of a file, of which NumPy has nothing to compile, unless they are traced
+    # NumPy, which compiles nothing, unless the numbers are traced
     factor: Any = (np if isinstance(each, np.ndarray) else jnp).diag(each)
     return Belief(mean, factor)

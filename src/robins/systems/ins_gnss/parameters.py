@@ -21,10 +21,10 @@ from robins.systems.study import Scenario
 
 
 class InsGnssImu(Parameters):
-    """The inertial sensors as the filter models them, and how they are mounted.
+    """The inertial sensors as modelled by the filter, and their mounting.
 
-    The biases are random walks that begin with the stated spread, or first-order Gauss-Markov
-    where a correlation time is given.
+    The biases are random walks with the stated initial sigma, or first-order Gauss-Markov if a
+    correlation time is given.
     """
 
     gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")]
@@ -38,24 +38,24 @@ class InsGnssImu(Parameters):
     scale_states: bool = False
     gyro_scale: Annotated[q.Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
     accel_scale: Annotated[q.Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
-    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of mount
+    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of the mounting
 
 
 class Gnss(Parameters):
-    """The receiver, its antenna and how far its stated sigmas are believed."""
+    """The receiver, its antenna, and corrections to its stated sigmas."""
 
     lever_arm: q.Arm = default("0 m")  # IMU to antenna, body
     latency: Annotated[float, Quantity("time", least="-10 s", most="10 s")] = default("0 s")
     use_velocity: bool = True
-    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix; not
-    # given: `robust` finds out, the others take it for 0
+    # window of the mean velocity: many receivers state that since the last fix; 0 s: the velocity
+    # at the fix; not given: estimated by `robust`, 0 for the others
     velocity_window: q.Time | None = None
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
     least_velocity_sigma: q.SpeedSize = default("0 m/s")
-    # `robust`: share of the variance of positions that lasts from fix to fix; not given: a replay
-    # finds it from the scatter of the fixes, a live filter takes it for 0
+    # `robust`: share of the variance of positions that is correlated from fix to fix; not given: a
+    # replay estimates it from the scatter of the fixes, a live filter assumes 0
     lasting_share: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] | None = None
     lasting_time: q.Duration = default("100 s")
 
@@ -67,22 +67,22 @@ class InsGnssStart(Parameters):
     heading: q.Spread = default("20 deg")
     velocity: q.Speed = default("0.2 m/s")
     position: q.Length = default("0.1 m")
-    # heading of the body at the first sample; without it, the course once above the speed
+    # heading of the body at the first sample; not given: the course, once above `course_speed`
     known_heading: q.Angle | None = None
     course_speed: q.Speed = default("1 m/s")
 
 
 class Aids(Parameters):
-    """Knowledge about the motion, used as measurements."""
+    """Constraints on the motion, used as measurements."""
 
     zero_velocity: bool = True
     standstill_velocity: q.Speed = default("0.01 m/s")
     standstill_rate: q.AngleRate = default("0.05 deg/s")
-    # at rest: spread of the samples over the window stays below these
+    # limits, at rest, of the standard deviation of samples over the window
     window: q.Duration = default("0.5 s")
     quiet_accel: q.Acceleration = default("0.15 m/s^2")
     quiet_rate: q.AngleRate = default("0.5 deg/s")
-    # a fix that is faster, and by four of its sigmas faster than nothing, says that it moves
+    # a fix proves motion if it is faster than this and than four of its sigmas
     moving_speed: q.Speed = default("0.2 m/s")
     non_holonomic: bool = False
     axle: q.Arm = default("0 m")  # IMU to rear axle, body
@@ -97,15 +97,15 @@ class Aids(Parameters):
 
 
 class Outages(Parameters):
-    """Times at which the GNSS is withheld, to see how long the inertial solution holds."""
+    """Times at which the GNSS is withheld, to measure the drift of the inertial solution."""
 
     length: q.Duration
     first: q.Time  # after the first fix
     gap: q.Duration  # between two outages
-    last: q.Time  # before the last fix none begins
+    last: q.Time  # no outage begins this shortly before the last fix
 
     def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
-        """Which times lie in an outage (N,) bool; outages repeat until none may begin any more.
+        """Mask (N,) of the times in an outage; outages repeat up to `last` before the last fix.
 
         The first and the last fix are at `first_s` and `last_s`.
         """
@@ -120,14 +120,14 @@ class InsGnssUpdate(LogPartition):
     """Steps of the filter."""
 
     longest_gap: q.Duration = default("1 s")
-    # of the other filters than `robust`; 0: no gate
+    # gate probability of the filters other than `robust`; 0: no gate
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999
-    # `robust`: for how long positions are off, where they are, in the mean
+    # `robust`: mean duration of a fault of positions
     patience: q.Duration = default("10 s")
 
 
 class UnknownImu(InsGnssImu):
-    """A unit of which nothing is told: a consumer-grade MEMS."""
+    """Default for an unknown unit: a consumer-grade MEMS."""
 
     gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
         "0.01 deg/s/sqrt(Hz)"
@@ -142,22 +142,22 @@ class UnknownImu(InsGnssImu):
 
 
 class UnknownReceiver(Gnss):
-    """A receiver of which nothing is told."""
+    """Default for an unknown receiver."""
 
-    # of every fix, in the place of what the log states; north, east, down, or one for all
+    # of every fix, instead of those in the log; north, east, down, or one for all
     sigma: Annotated[q.Three, Quantity("length", above="0 m")] | None = None
     velocity_sigma: Annotated[q.Three, Quantity("speed", above="0 m/s")] | None = None
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
 
 
 class UnknownStart(InsGnssStart):
-    """A start of which nothing is told."""
+    """Default for an unknown start."""
 
     tilt: q.Spread = default("3 deg")
 
 
 class InsGnssReplay(Parameters):
-    """A recorded log: what cannot be read from the files themselves; each part may be left out."""
+    """Parameters of a recorded log that its files do not contain; each part is optional."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
     title: str = "INS/GNSS replay, consumer MEMS"
@@ -171,14 +171,14 @@ class InsGnssReplay(Parameters):
     every_sample: bool = False  # write positions and attitudes at every inertial sample as well
 
     def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
-        """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""
+        """Mask (N,) of the times in an outage, for a log with fixes at the times `fix_s` (M,)."""
         if self.outages is None:
             return np.zeros(len(time_s), dtype=bool)
         return self.outages.mask(time_s, fix_s[0], fix_s[-1])
 
 
 class SimulatedReceiver(Gnss):
-    """A simulated receiver; its sigmas are true, and what it states."""
+    """A simulated receiver; it states its true sigmas."""
 
     rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
     sigma: Annotated[q.Three, Quantity("length", above="0 m")]
@@ -186,14 +186,14 @@ class SimulatedReceiver(Gnss):
 
 
 class InsGnssAssumptions(Parameters):
-    """Ratios of what the filters assume to what is true; 1 is right, anything else is a test."""
+    """Ratios of assumed to true values in the filters; 1 is right, anything else is a test."""
 
     q_factor: Positive = 1.0  # of the process noise covariance
     r_factor: Positive = 1.0  # of the fixes' covariance
 
 
 class Drive(Scenario):
-    """A simulated drive; sensor errors are drawn from what the filter is told of them."""
+    """A simulated drive; sensor errors are drawn with the sigmas that the filters assume."""
 
     system: str = "ins-gnss"
     study: str = "drive"
@@ -208,7 +208,7 @@ class Drive(Scenario):
     update: InsGnssUpdate = pydantic.Field(default_factory=InsGnssUpdate)
     outages: Outages | None = None
     believed: InsGnssAssumptions = pydantic.Field(default_factory=InsGnssAssumptions)
-    # figures pooled over time leave out what comes before, while heading errors are large
+    # figures pooled over time omit the time before, when heading errors are large
     settle: q.Time = default("0 s")
     filters: Names = ("ekf",)
 

@@ -1,12 +1,12 @@
-"""Path from samples and fixes to steps of the filter, chunk by chunk, of a log that goes on.
+"""Conversion of samples and fixes to filter steps, chunk by chunk, for a growing log.
 
-Increments, start, epochs and steps are those of a replay, made by the same functions of the part of
-the log that they look back at. Any chunks of the same samples give the same bits. Later samples are
-used as far as the latency of each stage reaches:
+Increments, start, epochs and steps are those of a replay, computed by the same functions from the
+recent part of the log. The result does not depend, to the bit, on the division into chunks. Each
+stage uses later samples, within its latency:
 
 - an increment is known with the next sample;
 - the turn rate at an epoch is a mean about it: `reach_of_rate`;
-- the start needs a fix that shows the course, or rest where the heading is given.
+- the start needs a fix that shows the course, or rest if the heading is given.
 """
 
 from __future__ import annotations
@@ -30,47 +30,47 @@ from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_sta
 from robins.systems.parts import ImuBlock
 from robins.systems.streaming import LiveError, numbers, refuse_units
 
-_AHEAD_S = 10.0  # of the newest sample, by which a fix may be
-_COURSE_S = 30.0  # how long a course is waited for
-_UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: whose size tells their unit, for the start
-_CONTEXT = 3  # samples that an increment needs besides its last
-# Of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s], its
-# sigmas, quality; what is missing is NaN.
+_AHEAD_S = 10.0  # most that a fix may be ahead of the newest sample
+_COURSE_S = 30.0  # wait for a course before a magnetometer is used
+_UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: to check their unit; kept for the start
+_CONTEXT = 3  # samples that an increment needs before its last
+# Row of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s],
+# its sigmas [m/s], quality; NaN where missing.
 WIDTH = 14
 MEASURED = [1, 2, 3, 7, 8, 9]  # components of a fix that a filter uses
 
 
 class InsGnssPath:
-    """Samples and fixes to steps of the filter (see the module).
+    """Converter of samples and fixes to steps of the filter (see the module).
 
     Attributes:
-        origin_ns: stamp of the first sample, at which the clock of the path begins.
-        time_ns: (M,) stamps of the last samples; none before the first.
-        first_fix_s: s, of the first whole fix.
-        reach_s: s, by which the steps are behind the samples.
+        origin_ns: stamp of the first sample, zero of the clock of the path.
+        time_ns: (M,) stamps of the last samples; empty before the first.
+        first_fix_s: s, time of the first complete fix.
+        reach_s: s, lag of the steps behind the samples.
     """
 
     def __init__(self, parameters: InsGnssReplay, usual: UsualIntervals, delay_s: float):
-        """Begin.
+        """Create a converter without samples.
 
         Args:
-            parameters: as of a replay.
+            parameters: as for a replay.
             usual: intervals of samples and fixes.
-            delay_s: s, by which a fix may be late: the part of the log before is forgotten.
+            delay_s: s, largest delay of a fix; older parts of the log are dropped.
         """
         self._parameters = p = parameters
         self.origin_ns, self.time_ns = 0, np.zeros(0, np.int64)
-        self._raw = np.zeros((0, 6))  # the samples of these stamps
-        self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment kept
+        self._raw = np.zeros((0, 6))  # (M, 6) samples of these stamps
+        self._steps = np.zeros((0, 8))  # end [s], dt, theta, dv of each increment kept
         self._first = 0  # number of increments before these
-        self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
+        self._newest = np.zeros((0, 8))  # the last increment, provisional
         self.fixes = np.zeros((0, WIDTH))  # rows of `row_of`, by time
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._known, self._velocities = tuple(usual), False
         self.first_fix_s = math.inf
-        self._tick, self._ask_s = 0, 0.0  # tenth of a second of the last look for a start
+        self._tick, self._ask_s = 0, 0.0  # tenth of a second of the last search for a start
         self.reach_s = reach_of_rate(usual.sample_s)
-        # what has to be looked back at from the oldest epoch
+        # history needed before the oldest epoch
         self._settled = 2 * max(2, round(p.aids.window / usual.sample_s)) + 1  # samples
         back = max(p.gnss.velocity_window or 0.0, 1.5, 4.0 * usual.fix_s)
         settling_s = 2.0 * p.aids.window + 2.0 * usual.sample_s
@@ -81,14 +81,14 @@ class InsGnssPath:
         return UsualIntervals(*self._known)
 
     def seconds(self, time_ns: int) -> float:
-        """A stamp on the clock of the path [s]; NaN before the first sample."""
+        """Time [s] of a stamp on the clock of the path; NaN before the first sample."""
         return (time_ns - self.origin_ns) * 1e-9 if len(self.time_ns) else math.nan
 
     def push(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
-        """Take samples.
+        """Add samples.
 
         Args:
-            time_ns: (M,) int64, rising.
+            time_ns: (M,) int64, increasing.
             rows: (M, 6) gyro [rad/s] and accel [m/s^2] in body axes.
         """
         if not len(self.time_ns):
@@ -102,20 +102,20 @@ class InsGnssPath:
         made, end_ns = from_imu(table, self._usual.sample_s)
         ends = (end_ns - self.origin_ns) * 1e-9
         found = np.column_stack([ends, *(np.asarray(a, float) for a in made[:3])])
-        if len(self._raw) > _CONTEXT:  # else the next samples change them all
+        if len(self._raw) > _CONTEXT:  # else later samples change all increments
             self._steps = np.concatenate([self._steps, found[1 if final else 0 : -1]])
         self._newest = found[-1:]
 
     def push_field(self, time_ns: int, field_b: np.ndarray) -> None:
-        """Take a reading (3,) [T] of a magnetometer, for the start."""
+        """Add a magnetometer reading (3,) [T], in body axes, for the start."""
         self._field = np.concatenate([self._field, [[self.seconds(time_ns), *field_b]]])
 
     def refused(self, row: np.ndarray, oldest_s: float) -> str:
-        """Reason why a fix is refused; "" for one that is taken.
+        """Reason for refusing a fix; "" if it is accepted.
 
         Args:
             row: of `row_of`.
-            oldest_s: s, of the oldest epoch that can be gone back to.
+            oldest_s: s, oldest epoch to which the filter can return.
         """
         newest_s = self._newest[0, 0] if len(self._newest) else 0.0
         if math.isnan(row[0]) or row[0] <= 0.0:
@@ -128,7 +128,7 @@ class InsGnssPath:
         return "ahead" if row[0] > newest_s + _AHEAD_S else nothing
 
     def push_fix(self, row: np.ndarray) -> None:
-        """Take a fix, a row of `row_of`, in any order."""
+        """Add a fix, a row of `row_of`, in any order of time."""
         at = int(np.searchsorted(self.fixes[:, 0], row[0]))
         self.fixes = np.insert(self.fixes, at, row, axis=0)
         self._velocities |= bool(np.any(np.isfinite(row[7:10])))
@@ -138,7 +138,7 @@ class InsGnssPath:
     # --------------------------------------------------------------------------------- start
 
     def start(self) -> tuple[float, StartPoint, Belief] | None:
-        """Time [s], start and belief where a replay of the log so far would begin; None: not yet.
+        """Time [s], start and belief of a replay of the log so far; None if it cannot start yet.
 
         Raises:
             LiveError: the samples are of another unit.
@@ -151,7 +151,7 @@ class InsGnssPath:
             rows = self._steps
         tick = int(10.0 * rows[-1, 0])
         if tick == self._tick:
-            return None  # ten times a second are enough
+            return None  # search ten times per second
         self._tick = tick
         given, waits = p.start.known_heading is not None, rows[-1, 0] - self.first_fix_s
         compass = len(self._field) > 0 and waits > _COURSE_S and rows[-1, 0] >= self._ask_s
@@ -161,7 +161,7 @@ class InsGnssPath:
         try:
             found = find_start(log, p.start, p.aids, self._usual, p.gnss)
         except ValueError:
-            # not yet; a magnetometer that was refused is asked again after a tenth of the wait
+            # not yet; a refused magnetometer is tried again after a tenth of the wait
             self._ask_s = rows[-1, 0] + 0.1 * waits if compass else 0.0
             return None
         if given and not found.sentence.startswith("levelled at rest") and waits < REST_S:
@@ -171,14 +171,14 @@ class InsGnssPath:
         return float(log.gnss_s[found.fix]), found, first_belief(log, found, p)
 
     def seek_again(self) -> None:
-        """Let the next `start` look, whenever the last one did."""
+        """Let the next `start` search, however recent the last search was."""
         self._tick = 0
 
     def _halve(self) -> None:
-        """Drop the older half of the samples, but for how they turned.
+        """Replace the older half of the increments by one with their total rotation.
 
-        A heading that is given is that at the end of the first increment, so this one stays, and
-        one increment of all that are dropped follows it.
+        A given heading is that at the end of the first increment, so this one is kept, followed
+        by the sum of those dropped.
         """
         begin, rows = len(self._steps) // 2, self._steps
         gone, end_s = rows[1:begin], rows[begin - 1, 0]
@@ -191,7 +191,7 @@ class InsGnssPath:
         self.fixes = self.fixes[self.fixes[:, 0] > end_s]
 
     def _log(self, until_s: float = math.inf) -> Log:
-        """Increments, and fixes up to a time, as a piece of a log."""
+        """Piece of a log with the increments kept, and the fixes up to a time."""
         rows, f, gnss = self._steps, self.fixes, self._parameters.gnss
         f = f[f[:, 0] <= until_s]
         table = table_of(f, self.origin_ns, self._velocities)
@@ -206,7 +206,7 @@ class InsGnssPath:
             np.zeros(len(f), dtype=bool),
             first=self._first,
         )
-        if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
+        if gnss.use_velocity:  # present even without data, so that the first one compiles nothing
             stated = table_of(f, self.origin_ns, velocities=True)
             log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(stated, gnss)[1])
         if len(self._field):
@@ -216,17 +216,17 @@ class InsGnssPath:
     # --------------------------------------------------------------------------------- steps
 
     def due(self, time_s: float, wanted_s: float) -> list[tuple[float, float]]:
-        """Epochs after one that later samples do not change, each as this one is stated.
+        """Final epochs after a given one, as pairs (time_s, wanted_s).
 
         Args:
-            time_s: s, of the epoch.
-            wanted_s: s, of the last fix, or start, up to there: blocks are counted from it.
+            time_s: s, of the given epoch.
+            wanted_s: s, of the last fix, or the start, up to it: blocks are counted from there.
         """
         known_s = self._steps[-1, 0] - self.reach_s if len(self._steps) else -math.inf
         longest_s, fixes_s = self._parameters.update.longest_block, self.fixes[:, 0]
         if known_s <= time_s:
             return []
-        # one block beyond what is known, whose end is none
+        # one block further, whose end is not an epoch
         edges = epochs_between(wanted_s, known_s + longest_s, fixes_s, longest_s, even=False)
         out = []
         for edge_s in edges[(edges > time_s) & (edges <= known_s)].tolist():
@@ -235,13 +235,13 @@ class InsGnssPath:
         return out
 
     def steps(self, begin_s: float, epochs: np.ndarray) -> InsGnssSteps:
-        """Steps from an epoch to later ones (E,) [s] of `due`."""
+        """Steps from an epoch to later ones (E,) [s] from `due`."""
         log = self._log()
         used = np.isin(log.gnss_s, epochs)
         return steps_of(log, used, begin_s, epochs, self._parameters, self._usual)
 
     def since(self, begin_s: float) -> ImuBlock:
-        """Block (1, K) from an epoch to the newest sample, as far as its increment is known."""
+        """Block (1, K) from an epoch to the newest sample, whose last increment is provisional."""
         rows = self._steps[self._steps[:, 0] > begin_s - 2.0 * self._usual.sample_s]
         final_s = rows[-1, 0] if len(rows) else begin_s
         rows = np.concatenate([rows, self._newest[self._newest[:, 0] > final_s]])
@@ -249,7 +249,7 @@ class InsGnssPath:
         return blocks_of(inc, rows[:, 0], begin_s, epochs, self._parameters, self._usual, 8)
 
     def forget(self, oldest_s: float) -> None:
-        """Drop, in large pieces, what no step from an epoch on looks back at."""
+        """Drop history that no step from an epoch on needs, in large pieces."""
         begin = oldest_s - self._back_s
         if self._steps[0, 0] >= begin - self._back_s:
             return
@@ -257,24 +257,24 @@ class InsGnssPath:
         since_s = float(self._steps[min(first + self._settled, len(self._steps) - 1), 0])
         aids, usual = self._parameters.aids, self._usual
         self._known = tuple(known_until(self._log(), aids, usual, since_s))
-        # a way over an outage begins at the last place before it
+        # a displacement across an outage starts at the last position before it
         far = self.fixes[:, 0] <= begin - WAYS_S[-1] - 2.0 * max(1.0, usual.fix_s)
         placed = np.flatnonzero(far & np.all(np.isfinite(self.fixes[:, 1:3]), axis=1))
         self.fixes = self.fixes[placed[-1] if len(placed) else 0 :]
         self._keep(first)
 
     def _keep(self, begin: int) -> None:
-        """Drop increments before a row."""
+        """Drop the increments before index `begin`."""
         self._steps, self._first = self._steps[begin:], self._first + begin
 
 
 def row_of(
     time_s: float, place: Any, sigma_m: Any, v_n: Any, sigma_v: Any, quality: Any
 ) -> np.ndarray:
-    """(14,) row of a fix.
+    """Row (14,) of a fix, see `WIDTH`.
 
     Raises:
-        LiveError: a vector of another kind, a velocity without sigmas, angles that are no radians.
+        LiveError: a malformed vector, a velocity without sigmas, or angles beyond those in radians.
     """
     where, sigma = numbers("lat_rad, lon_rad, alt_m", place, 3), numbers("sigma_m", sigma_m, 3)
     missing = np.full(3, np.nan)
@@ -285,7 +285,7 @@ def row_of(
     if abs(where[0]) > np.pi / 2 or abs(where[1]) > 2.0 * np.pi:
         what = f"latitude {where[0]:.4g} and longitude {where[1]:.4g} are no radians"
         raise LiveError(what, "push_fix", "of degrees give np.radians")
-    # as of a log that was cleaned: a component whose sigma is none is missing
+    # as in a cleaned log: a component without a positive sigma is missing
     where = np.where(np.isfinite(where) & (sigma > 0.0), where, np.nan)
     velocity = np.where(np.isfinite(velocity) & (spread > 0.0), velocity, np.nan)
     sigma = np.where(sigma > 0.0, sigma, 1.0)
@@ -294,7 +294,7 @@ def row_of(
 
 
 def table_of(rows: np.ndarray, origin_ns: int, velocities: bool) -> GnssTable:
-    """Rows (M, 14), whose times count from an origin, as a table with velocities or without."""
+    """Table of rows (M, 14), with times relative to `origin_ns`, with or without velocities."""
     time_ns = np.round(rows[:, 0] * 1e9).astype(np.int64) + origin_ns
     v, spread = (rows[:, 7:10], rows[:, 10:13]) if velocities else (None, None)
     quality = rows[:, 13].astype(int)

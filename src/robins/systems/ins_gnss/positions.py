@@ -1,9 +1,9 @@
-"""Velocity and course from positions, where a receiver states no velocity.
+"""Velocity and course from positions, for receivers without velocity.
 
-A weighted line goes through the positions of a window that ends with a fix. Of windows from 0.25
-to 32 s the one counts that leaves the least uncertainty: a short one has little to average, and
-over a long one an error of the tilt passes for a change of velocity. Nothing after the fix is used,
-so that a live filter begins as a replay does.
+A weighted line is fitted to the positions of a window that ends with a fix. Of windows from 0.25 to
+32 s the one with the least uncertainty is used: a short one averages little, and over a long one a
+tilt error causes a velocity error. Nothing after the fix is used, so that a live filter starts as a
+replay does.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from robins.systems.ins_gnss.recording import Log
 from robins.systems.ins_gnss.rest import WAYS_S, ways
 
 WINDOWS_S = (0.25, 0.5, *WAYS_S)
-MOST = 9  # positions of a window, evenly spaced: of a fast receiver the next ones are alike
-LEAST = 3  # two leave nothing by which to see that one is wrong
-SURE = 5.0  # sigmas of a speed that gives a course: by chance once in 3e5 fixes at rest
+MOST = 9  # positions of a window, evenly spaced; those of a fast receiver are redundant
+LEAST = 3  # two give no residual that reveals a faulty one
+SURE = 5.0  # sigmas of a speed to give a course: by chance once in 3e5 fixes at rest
 _G = 9.81
 
 
 def attitudes(q: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """(N, 4) attitudes from q (4,) on, after each of N rotation vectors (N, 3) in body axes."""
+    """Attitudes (N, 4) after each of N body rotation vectors (N, 3) [rad], from q (4,) on."""
     return named_scan(_turned_by, q, theta)[1]
 
 
@@ -38,7 +38,7 @@ def _turned_by(q: Array, theta: Array) -> tuple[Array, Array]:
 
 
 def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
-    """The same tilt with another heading."""
+    """Attitude q_nb (4,) with the same tilt and another heading."""
 
     def turned_to(q_nb, heading_rad):
         _, _, now = rotation.to_euler(q_nb)
@@ -55,9 +55,9 @@ def heading_of(q_nb: np.ndarray) -> float:
 
 
 def course_fix(log: Log, start: InsGnssStart) -> int | None:
-    """Row of the first fix without a velocity whose positions give a course; None: there is none.
+    """Row of the first fix without a velocity whose positions give a course; None if none does.
 
-    The speed is `start.course_speed` or more, and `SURE` times its sigma.
+    The speed must be at least `start.course_speed`, and `SURE` times its sigma.
     """
     missing = np.ones(len(log.gnss_s), bool)
     if log.gnss.v_n is not None:
@@ -72,16 +72,16 @@ def course_fix(log: Log, start: InsGnssStart) -> int | None:
 def best_lines(
     log: Log, ends: np.ndarray, tilt_rad: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Velocities of lines through the positions before fixes, in the best window of each.
+    """Velocities of lines through the positions up to some fixes, in the best window of each.
 
     Args:
         log: fixes.
-        ends: (K,) rows of whole fixes, with which the windows end.
-        tilt_rad: sigma of the tilt, through which gravity passes for a change of velocity.
+        ends: (K,) rows of complete fixes, the last of each window.
+        tilt_rad: sigma of the tilt, which projects gravity into the horizontal.
 
     Returns:
-        (K, 3) m/s, (K,) its larger horizontal sigma, and (K,) the window [s]; NaN, infinite and 0
-        where no window has enough positions.
+        Velocities (K, 3) [m/s, NED], their larger horizontal sigmas (K,) [m/s], and windows (K,)
+        [s]; NaN, infinite and 0 if no window has enough positions.
     """
     found = np.full((len(ends), 3), np.nan), np.full(len(ends), np.inf), np.zeros(len(ends))
     for window_s in WINDOWS_S:
@@ -104,23 +104,23 @@ def fitted(
     bias: np.ndarray,
     heading_known: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """State at a fix by the positions before it, with the way of the IMU in between taken out.
+    """State at a fix from the positions up to it, corrected for the motion measured by the IMU.
 
-    The model is p(t) = p + v (t - t_fix) + d(t) + C(t) l, where d is the specific force summed up
-    twice and l the lever arm: what is left of the motion is a line, whatever the vehicle does.
+    The model is p(t) = p + v (t - t_fix) + d(t) + C(t) l, where d is the double integral of the
+    acceleration and l the lever arm: the remaining motion is a line, whatever the vehicle does.
 
     Args:
         log: increments and fixes.
-        fix: row of a whole fix, for which `best_lines` finds a window.
-        q_nb: (4,) at the increment that holds the fix.
+        fix: row of a complete fix, for which `best_lines` finds a window.
+        q_nb: (4,) at the increment that contains the fix.
         tilt_rad: sigma of its tilt.
         gnss: lever arm and latency.
         bias: (3,) rad/s of the gyros.
-        heading_known: if not, the body points along the velocity, and q_nb is turned there.
+        heading_known: if False, the body points along the velocity, and q_nb gets that heading.
 
     Returns:
-        q_nb (4,), offset (3,) m of the IMU from the fix, velocity (3,) m/s, and the covariance
-        (3, 2, 2) of velocity and position on each axis, north, east, down.
+        q_nb (4,), offset (3,) [m] of the IMU from the fix, velocity (3,) [m/s], and covariance
+        (3, 2, 2) of velocity and position on each axis; north, east, down.
     """
     window_s = float(best_lines(log, np.array([fix]), tilt_rad)[2][0])
     time_s, place, sigma = _gathered(log, np.array([fix]), window_s)
@@ -128,8 +128,8 @@ def fitted(
         v = _lines(time_s, place, sigma)[1][0]
         q_nb = with_heading(q_nb, float(np.arctan2(v[1], v[0])))
     moved, arms = _between(log, fix, q_nb, gnss, bias, time_s[0])
-    time_s = time_s - gnss.latency  # at which the positions were true
-    for _ in range(1 if heading_known else 4):  # of a turn the line has the course of its middle
+    time_s = time_s - gnss.latency  # times of validity of the positions
+    for _ in range(1 if heading_known else 4):  # in a turn, the first course lags
         p, v, spread = _lines(time_s, place - (moved + arms)[None], sigma)
         heading = float(np.arctan2(v[0, 1], v[0, 0]))
         if not heading_known:
@@ -138,13 +138,13 @@ def fitted(
             q_nb = with_heading(q_nb, heading)
     p, v, spread = _lines(time_s, place - (moved + arms)[None], sigma)
     lasted = -float(np.nanmin(time_s))
-    # of velocity and place at the end
+    # error of velocity and position at the end, per tilt error
     drift = _G * tilt_rad * np.array([lasted / 2.0, lasted**2 / 12.0])
     return q_nb, p[0], v[0], spread[0] + np.outer(drift, drift)
 
 
 def _whole(log: Log) -> np.ndarray:
-    """(M,) bool, fixes with three coordinates within the IMU's time that are not withheld."""
+    """Mask (M,) of complete fixes within the time of the IMU that are not withheld."""
     g, begin_s = log.gnss, log.time_s[0] - log.increments.dt[0]
     whole = np.all(np.isfinite([g.lat_rad, g.lon_rad, g.alt_m]), axis=0) & ~log.withheld
     return whole & (log.gnss_s > begin_s) & (log.gnss_s <= log.time_s[-1])
@@ -153,7 +153,10 @@ def _whole(log: Log) -> np.ndarray:
 def _gathered(
     log: Log, ends: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (K, MOST) [s] and places (K, MOST, 3) [m, NED] from each end, and sigmas; NaN: none."""
+    """Times (K, MOST) [s] and positions (K, MOST, 3) [m, NED] relative to each end, and sigmas.
+
+    NaN times and positions fill up windows with fewer fixes.
+    """
     known, g = np.flatnonzero(_whole(log)), log.gnss
     wanted = log.gnss_s[ends][:, None] - window_s * np.linspace(1.0, 0.0, MOST) - 1e-6
     at = np.minimum(np.searchsorted(log.gnss_s[known], wanted), max(len(known) - 1, 0))
@@ -172,10 +175,10 @@ def _gathered(
 def _lines(
     time_s: np.ndarray, place: np.ndarray, sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted lines: place and velocity (K, 3) at time 0, covariance (K, 3, 2, 2) of (v, p).
+    """Weighted lines: position and velocity (K, 3) at time 0, covariance (K, 3, 2, 2) of (v, p).
 
-    Sigmas grow with what the positions differ from the line beyond theirs (Birge's ratio), so that
-    one that is wrong by far makes no velocity. NaN, and infinite, where there are too few.
+    Covariances are scaled up if the residuals exceed the sigmas (Birge ratio), so that a gross
+    error of a position gives no velocity. NaN, with infinite covariance, if there are too few.
     """
     here = np.isfinite(time_s)
     count = np.sum(here, axis=1)
@@ -195,7 +198,7 @@ def _lines(
 
 
 def _summed(x: np.ndarray) -> np.ndarray:
-    """Sum over axis 1, with the same bits however many rows there are."""
+    """Sum over axis 1, to the same bits for any number of rows."""
     total = np.zeros((x.shape[0], x.shape[2]))
     for k in range(x.shape[1]):
         total += x[:, k]
@@ -205,9 +208,9 @@ def _summed(x: np.ndarray) -> np.ndarray:
 def _between(
     log: Log, fix: int, q_nb: np.ndarray, gnss: Gnss, bias: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ways (MOST, 3) [m] that the IMU measured from fixes to the last, and antennas from the IMU.
+    """IMU motion d(t) (MOST, 3) and lever arms C(t) l (MOST, 3) [m, NED] at the fixes of a window.
 
-    A fix stamped t is of t - latency; the state is that of the last stamp.
+    See `fitted`. A fix stamped t is valid at t - latency; the state is that at the last stamp.
     """
     now_s, (dt, theta, dv) = log.gnss_s[fix], log.increments[:3]
     last = int(np.searchsorted(log.time_s, now_s))

@@ -1,4 +1,4 @@
-"""A recorded log on one clock, along the vehicle's axes, with the sigmas that a filter believes."""
+"""Recorded log on one clock, in the vehicle's axes, with the sigmas that a filter assumes."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from robins.ins.frames import to_ned_frd, turned
 from robins.ins.increments import Increments, from_imu, own_intervals
 from robins.systems.ins_gnss.parameters import InsGnssReplay, UnknownReceiver
 
-TYRES = 0.02  # share of the speed by which wheels may read wrong: tyres, pressure, slip
+TYRES = 0.02  # relative sigma of the wheel speed due to tyres, pressure, slip
 
 
 class WheelSpeed(NamedTuple):
-    """Forward speed by the wheels."""
+    """Forward speed measured by the wheels."""
 
     time_s: np.ndarray  # (W,)
     speed: np.ndarray  # (W,) m/s
-    sigma: np.ndarray  # (W,) m/s, with what tyres may do
+    sigma: np.ndarray  # (W,) m/s, including `TYRES`
 
 
 class Log(NamedTuple):
-    """A log or a piece of it, NED/FRD, in seconds since the first IMU sample."""
+    """A log or a piece of it, NED/FRD, with times [s] since the first IMU sample."""
 
     increments: Increments  # dt (N,), theta (N, 3), dv (N, 3)
     time_s: np.ndarray  # (N,) end of each increment
     gnss: GnssTable  # M fixes, of the whole log
     gnss_s: np.ndarray  # (M,)
-    sigma_m: np.ndarray  # (M, 3) believed by the filter
-    v_n: np.ndarray | None  # (M, 3), None where velocities are not used
+    sigma_m: np.ndarray  # (M, 3) assumed by the filter
+    v_n: np.ndarray | None  # (M, 3) m/s, None if velocities are not used
     sigma_v: np.ndarray | None
     withheld: np.ndarray  # (M,) bool
-    field_s: np.ndarray | None = None  # (K,) of a magnetometer, where there is one
+    field_s: np.ndarray | None = None  # (K,) times of a magnetometer, if there is one
     field_b: np.ndarray | None = None  # (K, 3) T, body axes
     wheels: WheelSpeed | None = None
     first: int = 0  # number of increments of the record before these
 
 
 def as_rates(dataset: Dataset) -> Dataset:
-    """Log with rates in the place of increments, forward-right-down and north-east-down."""
+    """Log with rates instead of increments, forward-right-down and north-east-down."""
     imu = to_ned_frd(dataset.imu)
     if imu.kind == "increment":
         dt = own_intervals(np.diff(imu.time_ns) * 1e-9, imu.gyro, imu.accel)[:, None]
@@ -53,11 +53,11 @@ def as_rates(dataset: Dataset) -> Dataset:
 
 
 def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
-    """The samples along the vehicle's axes, unless the log was loaded with a mounting.
+    """Log with samples rotated into the vehicle's axes; unchanged if loaded with a mounting.
 
     Args:
         dataset: a log.
-        orientation: roll, pitch, yaw [rad] of forward-right-down as seen from the sensor.
+        orientation: roll, pitch, yaw [rad] of forward-right-down relative to the sensor axes.
     """
     if dataset.mounted or not any(orientation):
         return dataset
@@ -72,22 +72,22 @@ def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
 
 
 def axes_of(orientation: Sequence[float]) -> np.ndarray:
-    """(3, 3) from the sensor's axes to forward-right-down; orientation as in `in_body_axes`."""
+    """Matrix (3, 3) from sensor axes to forward-right-down; orientation as in `in_body_axes`."""
     C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*np.asarray(orientation)))).T
-    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
+    whole = np.round(C_bs)  # rotations by right angles are exact
     return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
 
 
 def believed_sigmas(
     gnss: GnssTable, parameters: UnknownReceiver
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used.
+    """Sigmas (M, 3) [m] and (M, 3) [m/s] that the filter assumes; None for unused velocities.
 
     Args:
         gnss: with sigmas; factors by quality apply only to those that the receiver states, not to
-            those marked as assumed, which are those of a kind of fix.
-        parameters: of the receiver; its own sigmas stand in the place of those of the log, and
-            factors by quality apply to them.
+            those marked as assumed, which already depend on the kind of fix.
+        parameters: of the receiver; sigmas given here replace those of the log, and factors by
+            quality apply to them.
     """
     g, factor = parameters, np.ones(len(gnss))
     if gnss.quality is not None:
@@ -109,7 +109,7 @@ def believed_sigmas(
 
 
 def on_one_clock(dataset: Dataset, parameters: InsGnssReplay) -> Log:
-    """Both tables on the IMU's clock, sigmas as the filter shall believe them.
+    """Tables of a log on the IMU's clock, with the sigmas that the filter assumes.
 
     Raises:
         ValueError: there is no GNSS, or no fix lies within the IMU's time.
@@ -144,7 +144,7 @@ def on_one_clock(dataset: Dataset, parameters: InsGnssReplay) -> Log:
 
 
 def _wheels(dataset: Dataset, origin_ns: int) -> WheelSpeed | None:
-    """Whole rows of the odometry, in the order of time; None without one."""
+    """Complete rows of the odometry, ordered by time; None without odometry."""
     rows = dataset.odometry
     if rows is None:
         return None
@@ -156,7 +156,7 @@ def _wheels(dataset: Dataset, origin_ns: int) -> WheelSpeed | None:
 
 
 def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Times and whole readings of the magnetometer; None of both without one."""
+    """Times (K,) [s] and complete readings (K, 3) [T] of the magnetometer; None without one."""
     if dataset.mag is None:
         return None, None
     mag = to_ned_frd(dataset.mag)
@@ -167,10 +167,10 @@ def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndar
 def with_lever_arm(
     parameters: InsGnssReplay, arm: tuple[float, float, float] | None
 ) -> InsGnssReplay:
-    """The parameters with the lever arm that the log was loaded with, if it was with one.
+    """Parameters with the lever arm that the log was loaded with, if any.
 
     Raises:
-        ValueError: the parameters have another.
+        ValueError: the parameters have a different one.
     """
     other = parameters.gnss.lever_arm
     if arm is None:

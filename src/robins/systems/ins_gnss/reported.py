@@ -1,4 +1,4 @@
-"""Arrays, distances and sentences that a replay of INS/GNSS reports beside its estimates."""
+"""Arrays, distances and sentences in the report of a replay of INS/GNSS, besides estimates."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from robins.systems.replaying import FilterEstimates
 from robins.systems.tables import place_arrays
 
 DIVERGED = "the estimate was off and took the word of positions that stayed away"
-NIS_MOST, FAR = 4.0, 6.0  # beyond which a replay is not to be trusted
+NIS_MOST, FAR = 4.0, 6.0  # limits beyond which a replay is not to be trusted
 _OTHERS = {"velocity": "gnss.velocity_sigma", "place, velocity": "gnss.sigma, gnss.velocity_sigma"}
-_RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # of a quality, by its usual sigma
+_RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # rank of a quality, by its usual sigma
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
 def sigma_notes(dataset: Dataset, parameters: InsGnssReplay) -> list[str]:
-    """Sentences on sigmas of positions that the log does not state."""
+    """Sentences on sigmas of positions that are configured or assumed, not stated by the log."""
     if parameters.gnss.sigma is not None:
         shown = " ".join(f"{x:g}" for x in parameters.gnss.sigma)
         return [f"Sigmas of positions: {shown} m north, east, down, from gnss.sigma."]
@@ -41,7 +41,7 @@ def sigma_notes(dataset: Dataset, parameters: InsGnssReplay) -> list[str]:
 
 
 def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
-    """Position of the antenna as a filter estimates it, at each epoch."""
+    """Estimated position of the antenna at each epoch, for comparison with fixes."""
     return named_scan(_antenna, mount, (mean, rate_b))[1]
 
 
@@ -50,17 +50,17 @@ def _antenna(mount: model.Mount, row: tuple[InsState, Array]) -> tuple[model.Mou
 
 
 def _between(places: tuple[Geodetic, Geodetic]) -> Array:
-    """(3,) m, north, east, down, from one place to another."""
+    """Displacement (3,) [m, NED] from one position to another."""
     return places[0].local(places[1])
 
 
 def distances(
     log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic
 ) -> dict[str, float | int]:
-    """Distances of the antenna from the best fixes, with aids and in outages.
+    """Distances of the antenna from the best fixes, aided and in outages.
 
-    The best fixes are those of the quality whose usual sigma is the smallest of the fixes used;
-    all where the receiver states no quality.
+    The best fixes are those of the best quality among the fixes used, or all if the receiver states
+    no quality.
     """
     g = log.gnss
     use = used & np.isfinite(g.lat_rad) & np.isfinite(g.alt_m)
@@ -92,7 +92,7 @@ def _rms(x: np.ndarray) -> float:
 
 
 def fix_arrays(log: Log) -> Variables:
-    """The fixes of a log, on its clock."""
+    """Fixes of a log, on their own time axis."""
     g = log.gnss
     out: dict[str, Any] = {"gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes")}
     out |= place_arrays("gnss", (g.lat_rad, g.lon_rad, g.alt_m), "{} of the fixes")
@@ -108,16 +108,16 @@ def fix_arrays(log: Log) -> Variables:
 
 
 def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: list[str]) -> str:
-    """One sentence on whether a replay is good, by its first causal filter; "" without one.
+    """One-sentence verdict on a replay, from its first causal filter; "" without one.
 
-    "Do not trust" where sigmas are too small by a factor of two (NIS above `NIS_MOST`) or a third
-    of the fixes was refused, where the estimate was off, or is more than `FAR` sigmas from that of
-    its smoother. "Consistent" where NIS is inside the 95 % band of a tenth of the innovations, for
-    those of real fixes are correlated, and there is no warning; else "With care".
+    "Do not trust" if sigmas are too small by a factor of two (NIS above `NIS_MOST`), more than a
+    third of the fixes was refused, the estimate diverged, or it is more than `FAR` sigmas from that
+    of its smoother. "Consistent" if there is no warning and NIS is inside its 95 % band, computed
+    for one in `CORRELATED` innovations, since those of real fixes are correlated. Else "With care".
 
     Args:
-        answers: by filter.
-        metrics: by filter, as of `robins.systems.replaying.outcome`.
+        answers: estimates by filter.
+        metrics: by filter, as from `robins.systems.replaying.outcome`.
         doubts: warnings, which begin with the name of a filter.
     """
     key = f"nis_{model.POSITION}"

@@ -1,9 +1,9 @@
-"""Standstill of a vehicle, by its samples and by the evidence of fixes.
+"""Standstill detection of a vehicle, from inertial samples and the evidence of fixes.
 
-A fix of metres that lies where the last one lay excludes no slow motion. So fixes are compared over
-ways as long as their noise asks for: from the shortest time over which a motion of `_SEEN` times
-`aids.moving_speed` would have been seen, rest is certain, and from the shortest over which the way
-is beyond its noise, motion is.
+Two equal fixes with errors of metres do not exclude slow motion. Fixes are therefore compared over
+several intervals: rest is certain since the shortest one over which a motion of `_SEEN` times
+`aids.moving_speed` would have been detected, and motion since the shortest one over which the
+displacement exceeds its noise.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from robins.ins.rest import standstill
 from robins.systems.ins_gnss.parameters import Aids
 from robins.systems.ins_gnss.recording import Log
 
-WAYS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # times over which places are compared
+WAYS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # intervals over which positions are compared
 _SIGMAS = 4.0
-_SEEN = 5.0  # times the speed of motion: what moves faster would have been seen
-_CALMER = 0.5  # at rest without fixes: this share of the least unrest seen in motion, or less
+_SEEN = 5.0  # times `aids.moving_speed`: a speed that rest must exclude
+_CALMER = 0.5  # rest without fixes: unrest below this share of the least in motion
 
 
 class UsualIntervals(NamedTuple):
-    """Numbers of a whole log that a piece of it does not show."""
+    """Quantities of a whole log that cannot be found from a piece of it."""
 
     sample_s: float  # interval between samples
     fix_s: float  # between fixes
-    calmest: float = np.inf  # least unrest in motion, by the intervals that begin before `since_s`
+    calmest: float = np.inf  # least unrest in motion, over intervals that begin before `since_s`
     quiet_s: float = -np.inf  # last time before `since_s` at which the samples were not quiet
-    since_s: float = -np.inf  # before it statistics over windows lack samples
+    since_s: float = -np.inf  # earlier statistics over windows lack samples
 
 
 def usual_of(log: Log) -> UsualIntervals:
-    """Intervals of samples and of fixes in a log."""
+    """Usual intervals of samples and fixes in a log."""
     fix_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
     return UsualIntervals(usual_interval(log.increments.dt), fix_s)
 
 
 class Evidence(NamedTuple):
-    """Evidence of motion in each of M fixes, which may prove it, exclude it, or tell nothing."""
+    """Evidence of motion in each of M fixes, which may prove it, exclude it, or be inconclusive."""
 
     time_s: np.ndarray  # (M,) increasing
-    moves: np.ndarray  # (M,) bool, it moves now, or did within about a second
-    moved_s: np.ndarray  # (M,) beginning of the shortest time in which it has moved; NaN where none
-    rests_s: np.ndarray  # (M,) of the shortest time in which it has not moved; NaN where none
+    moves: np.ndarray  # (M,) bool, in motion now, or within about the last second
+    moved_s: np.ndarray  # (M,) begin of the shortest interval with motion; NaN if none
+    rests_s: np.ndarray  # (M,) begin of the shortest interval without motion; NaN if none
 
 
-# (N,) bool still by spread, (N, 3) mean rate [rad/s], (N,) unrest, evidence, how long it holds [s]
+# (N,) bool still by scatter, (N, 3) mean rate [rad/s], (N,) unrest, evidence, its validity [s]
 _Observed = tuple[np.ndarray, np.ndarray, np.ndarray, list[Evidence], float]
 
 
@@ -61,14 +61,14 @@ def at_rest(
     at_s: np.ndarray | None = None,
     lenient: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tell whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
+    """Mask (E,) of certain standstill, and mean raw gyro rate (E, 3) [rad/s].
 
     Args:
         log: samples and fixes.
-        aids: what rest is.
+        aids: limits of rest.
         usual: of the whole log.
-        at_s: (E,) times; None: the end of each increment.
-        lenient: where fixes that come say nothing, the spread of the samples decides.
+        at_s: (E,) times [s]; None: the end of each increment.
+        lenient: if fixes are inconclusive, the scatter of the samples decides.
     """
     still, mean_rate, unrest, evidence, wait_s = _observed(log, aids, usual)
     if lenient:
@@ -80,11 +80,11 @@ def at_rest(
 
 
 def known_until(log: Log, aids: Aids, usual: UsualIntervals, since_s: float) -> UsualIntervals:
-    """Numbers of a log of which only the part after a time is kept."""
+    """Update `usual` before the part of a log up to `since_s` is dropped."""
     still, _, unrest, evidence, wait_s = _observed(log, aids, usual)
     least = usual.calmest
     for one in evidence:
-        # with the two fixes that the last of these intervals is known by
+        # with the two fixes that end and confirm the last interval
         old = Evidence(*(a[: int(np.sum(one.time_s < since_s)) + 2] for a in one))
         found = calmest_in_motion(unrest, log.time_s, old, wait_s, usual, since_s)[-1]
         least = min(least, float(found))
@@ -94,7 +94,7 @@ def known_until(log: Log, aids: Aids, usual: UsualIntervals, since_s: float) -> 
 
 
 def rows_at(time_s: np.ndarray, at_s: np.ndarray | None) -> np.ndarray:
-    """(E,) rows of the increments, which end at times (N,), that hold times (E,); None: all."""
+    """Rows (E,) of the increments, ending at times (N,), that contain times (E,); None: all."""
     if at_s is None:
         return np.arange(len(time_s))
     return np.minimum(np.searchsorted(time_s, at_s - 1e-9), len(time_s) - 1)
@@ -115,25 +115,25 @@ def confirmed(
     usual: UsualIntervals,
     at_s: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Find the times at which what looks still is: a smooth road looks like rest.
+    """Confirm quiet samples as standstill by other evidence: a smooth road looks like rest.
 
-    The last fix of each source decides, where it proves motion, or excludes it for a time that
-    began after the samples became quiet; one that proves motion is enough. Where none does either,
-    since it is old or its noise is large, the unit counts as still only if it is plainly calmer
-    than it was in any interval before, between two fixes that said, as did the next, that it moves;
-    if there was none, spread alone tells nothing. Nothing of the future is used.
+    The last fix of each source decides if it proves motion, or excludes it since a time after the
+    samples became quiet; one source that proves motion suffices. If all are inconclusive, being old
+    or noisy, the unit counts as still only if it is much calmer than in every earlier interval of
+    motion, that is, between two fixes that prove motion, followed by a third that does; without
+    such an interval, scatter alone proves nothing. No future data are used.
 
     Args:
-        still: (N,) bool, by the spread of the samples.
-        unrest: (N,) the spread itself, in any unit.
+        still: (N,) bool, by the scatter of the samples.
+        unrest: (N,) the scatter itself, in any unit.
         time_s: (N,) increasing times of the samples.
         evidence: of motion and rest, by source.
-        wait_s: how long a fix tells it.
-        usual: what was known before these.
-        at_s: (E,) times; None: those of the samples.
+        wait_s: validity of a fix as evidence [s].
+        usual: quantities of the log before these samples.
+        at_s: (E,) times [s]; None: those of the samples.
 
     Returns:
-        (E,) bool.
+        Mask (E,) of standstill.
     """
     rows = rows_at(time_s, at_s)
     at_s = time_s if at_s is None else at_s
@@ -155,7 +155,7 @@ def confirmed(
 
 
 def quiet_since(still: np.ndarray, time_s: np.ndarray, usual: UsualIntervals) -> np.ndarray:
-    """(N,) last time up to each sample at which the samples were not quiet; arguments as above."""
+    """Last time (N,) up to each sample at which samples were not quiet; see `confirmed`."""
     quiet = still | (time_s < usual.since_s)
     return np.maximum(np.maximum.accumulate(np.where(quiet, -np.inf, time_s)), usual.quiet_s)
 
@@ -168,10 +168,10 @@ def calmest_in_motion(
     usual: UsualIntervals,
     until_s: float = np.inf,
 ) -> np.ndarray:
-    """(M + 1,) least unrest in motion as it is known after so many fixes; infinite: not known.
+    """Least unrest in motion (M + 1,) known after 0, 1, ... M fixes; infinite if unknown.
 
-    Arguments are those of `confirmed`. Only intervals that begin before `until_s` count; where it
-    is given, the last one does not wait for the fix after it.
+    Arguments as in `confirmed`. Only intervals that begin before `until_s` count; if it is given,
+    the last one needs no confirmation by the next fix.
     """
     fix_s, moves = evidence.time_s, evidence.moves
     least = np.full(len(fix_s) + 1, usual.calmest)
@@ -180,16 +180,16 @@ def calmest_in_motion(
     edges = np.searchsorted(time_s, fix_s)
     lowest = np.minimum.reduceat(np.append(unrest, np.inf), edges)[:-1]
     counts = (edges[:-1] < edges[1:]) & (np.diff(fix_s) <= wait_s) & moves[:-1] & moves[1:]
-    counts &= np.append(moves[2:], until_s < np.inf)  # the next one says so too
+    counts &= np.append(moves[2:], until_s < np.inf)  # confirmed by the next one
     counts &= (fix_s[:-1] >= usual.since_s) & (fix_s[:-1] < until_s)
     lowest = np.where(counts, lowest, np.inf)
-    least[3:] = lowest[:-1]  # from the next one on
+    least[3:] = lowest[:-1]  # known from the next one on
     least[-1] = min(least[-1], lowest[-1])
     return np.minimum.accumulate(least)
 
 
 def evidence_of(log: Log, speed: float, wait_s: float) -> list[Evidence]:
-    """Evidence of motion faster than a speed [m/s] by velocities, by ways and by wheels."""
+    """Evidence of motion faster than a speed [m/s] from velocities, displacements and wheels."""
     evidence = [_by_way(log, speed, wait_s)]
     if log.v_n is not None and log.sigma_v is not None:
         known = ~log.withheld & np.all(np.isfinite(log.v_n[:, :2]), axis=1)
@@ -203,14 +203,14 @@ def evidence_of(log: Log, speed: float, wait_s: float) -> list[Evidence]:
 
 
 def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: float) -> Evidence:
-    """Evidence of speeds (M,) with sigmas [m/s], each of its own instant."""
+    """Evidence from speeds (M,) with sigmas [m/s], each at one instant."""
     moves = size > np.maximum(speed, _SIGMAS * sigma)
     rests = ~moves & (size + _SIGMAS * sigma < _SEEN * speed)
     return Evidence(time_s, moves, *(np.where(x, time_s, np.nan) for x in (moves, rests)))
 
 
 def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
-    """Evidence of the ways to fixes without a velocity, from fixes before them."""
+    """Evidence from displacements to fixes without a velocity, from earlier fixes."""
     g = log.gnss
     known = ~log.withheld & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
     time_s, noise = log.gnss_s[known], np.max(log.sigma_m[known, :2], axis=1)
@@ -235,7 +235,7 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
 
 
 def ways(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """North and east [m] between places that differ by so little [rad] that their chart is flat."""
+    """Displacement north and east [m] of small differences of latitude and longitude [rad]."""
     square = 1.0 - E2 * np.sin(lat) ** 2
     across = A_M / np.sqrt(square)  # radius of curvature in the prime vertical
     along = across * (1.0 - E2) / square  # in the meridian

@@ -1,29 +1,30 @@
-"""The filter of a log that nobody tuned it for: fixes are weighed, none is refused for ever.
+"""Default INS/GNSS filter: IMM over position-fault hypotheses with Student-t weights.
 
-Every measurement has a weight of its own, that of noise with Student's t (`rules.student_t`), which
-answers a single one that is off. What the files of a log do not say is in the state, or is asked as
-hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
+It needs no tuning to a log, and refuses no fixes permanently. Student's t (`rules.student_t`)
+weights each measurement, against single outliers. Properties that a log does not state are states,
+or hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
 
-    x = (ins, z, share, o)   ins: the navigation state; tangent components behind its 15 or 21
+    x = (ins, z, share, o)   ins: the navigation state; the others follow its 15 or 21 components
 
-    z       (3,) NED: the part of the error of positions that lasts, over its sigma: first-order
-            Gauss-Markov (`robins.systems.ins_gnss.correlated_errors`); where the log shows such a
-            part
-    share   what a velocity is: that of the fix (0), or the mean since the last one (1); constant
-    o       (3,) m, NED: by how much positions are off, as multipath makes them
+    z       (3,) NED: time-correlated part of the position errors over its sigma, first-order
+            Gauss-Markov (`robins.systems.ins_gnss.correlated_errors`); only if the log shows such
+            a part
+    share   kind of the velocities: at the fix (0), or mean since the last one (1); constant
+    o       (3,) m, NED: offset of faulty positions, as from multipath
 
-    right 1, 8, 64   positions are right; the covariance of the process noise is so many times that
-                     which is told. A motion that was not foreseen is answered here.
-    begins           from this step on positions are off: o is new, of `OFF_M`
-    lasts            they are still off: o stays, but for a walk. Fixes tell the motion, not where
-    ends             they are right again, and the state was: o is dropped
-    wild             this position alone says nothing, as one at the other end of the Earth; what
-                     was known of o is dropped with it
-    strayed          they were right, and the state was off: o is added to the position and dropped
+    right 1, 8, 64   positions are right; the covariance of the process noise is the stated one
+                     times this factor, for unforeseen motion
+    begins           positions are off from this step on: o is new, with sigma `OFF_M`
+    lasts 1, 8, 64   positions are still off: o persists, with a random walk. Fixes give the motion,
+                     not the position
+    ends             positions are right again, and the state was right: o is dropped
+    wild             this position alone is meaningless, however far away; o is dropped with it
+    strayed          positions were right, and the state was off: it is corrected by o, which is
+                     dropped
 
-Whether positions that stay away are off or the state is, both are weighed: the stated covariance is
-that of the mixture, and grows while the two disagree. Probabilities of a change are rates times the
-time of a step, so that they do not depend on how often fixes come.
+Both explanations of positions that stay away, faulty positions or a diverged state, are weighted:
+the stated covariance is that of the mixture, and grows while they disagree. Probabilities of a
+change are rates times the duration of a step, so they do not depend on the rate of fixes.
 """
 
 from __future__ import annotations
@@ -61,42 +62,42 @@ from robins.systems.study import Case
 
 SCALES = (1.0, 8.0, 64.0)
 RISE, FALL = 1e-4, 1e-2  # probability in a step that the process noise changes upwards, and back
-OFF_M = 10.0  # m, sigma of what positions are off by when they are
-WILD_M = 1e6  # m, the same of one that says nothing
-WILD_S = 1000.0  # s from one such position to the next, in the mean
-WALK = 0.005  # m/sqrt(s), by which that wanders; more makes `lasts` less likely than `right`
-SELDOM_S = 100.0  # s from one time that positions are off to the next, in the mean
-LATER = math.exp(4.0) - 1.0  # `diverged` is so much rarer than `ends`: as likely after 4 patiences
-_SHARE = 0.5, 0.5  # mean and sigma before anything is seen
+OFF_M = 10.0  # m, sigma of the offset of faulty positions
+WILD_M = 1e6  # m, the same for a meaningless position
+WILD_S = 1000.0  # s, mean time between such positions
+WALK = 0.005  # m/sqrt(s), random walk of the offset; more makes `lasts` less likely than `right`
+SELDOM_S = 100.0  # s, mean time between faults of positions
+LATER = math.exp(4.0) - 1.0  # `ends` to `strayed`; equally likely after 4 patiences
+_SHARE = 0.5, 0.5  # initial mean and sigma
 _TAILS = 4.0  # degrees of freedom of Student's t
-HEAVIEST = 16.0  # times the covariance of a position, by its weight in a mode
+HEAVIEST = 16.0  # largest factor on the covariance of a position, by its weight in a mode
 
 
 class AugmentedInsState(NamedTuple):
-    """The navigation state and what is not known of its receiver."""
+    """Navigation state, with unknown properties of the receiver."""
 
     ins: InsState
     lasting: Array | None  # (3,) NED, of unit variance; None where errors of positions are white
-    share: Array | None  # (1,); None where the configuration says it
+    share: Array | None  # (1,); None if configured
     offset: Array  # (3,) m, NED
 
 
 class FixHypothesis(NamedTuple):
-    """Numbers of a mode; of the bank with a leading axis."""
+    """Parameters of a mode; with a leading axis, of the bank."""
 
-    scale: Any  # of the covariance of the process noise
-    read: Any  # 1 where positions are off by o
-    kept: Any  # 1 where o lasts
-    new: Any  # m, sigma of o where it is drawn anew
-    taken: Any  # 1 where the position takes o
+    scale: Any  # factor on the covariance of the process noise
+    read: Any  # 1 if positions are off by o
+    kept: Any  # 1 if o persists
+    new: Any  # m, sigma of a newly drawn o
+    taken: Any  # 1 if o is added to the position of the state
 
 
 COUNT = len(SCALES)
 RIGHT, LASTS = slice(COUNT), slice(COUNT, 2 * COUNT)
 BEGINS, ENDS, STRAYED, WILD = range(2 * COUNT, 2 * COUNT + 4)
-"""Where the modes stand in the bank."""
+"""Indices of modes in the bank."""
 
-_IMU, _POSITION = (IMU,), (POSITION,)  # what is wrong
+_IMU, _POSITION = (IMU,), (POSITION,)  # suspects at fault
 _ROWS = [
     HypothesisRow(FixHypothesis(s, off, off, 0.0, 0.0), _POSITION * int(off) + _IMU * (s > 1.0))
     for off in (0.0, 1.0)
@@ -105,7 +106,7 @@ _ROWS = [
     HypothesisRow(FixHypothesis(SCALES[1], 1.0, 0.0, OFF_M, 0.0), _POSITION),
     HypothesisRow(FixHypothesis(SCALES[1], 0.0, 0.0, 0.0, 0.0)),
     HypothesisRow(FixHypothesis(SCALES[1], 0.0, 0.0, 0.0, 1.0), _IMU),
-    # it leads to no mode that keeps its o: so wide a spread would be mixed into what `lasts` knows
+    # it leads to no mode that keeps o: so large a sigma would spoil the o of `lasts` by mixing
     HypothesisRow(FixHypothesis(SCALES[0], 1.0, 0.0, WILD_M, 0.0), _POSITION),
 ]
 HYPOTHESES = stacked(_ROWS)
@@ -113,11 +114,11 @@ AS_TOLD = FixHypothesis(*np.array(_ROWS[0].numbers))
 
 
 def mode_changes(step_s: float, patience_s: float) -> np.ndarray:
-    """(modes, modes) probabilities to change in a step.
+    """Transition probabilities (modes, modes) of a step.
 
     Args:
-        step_s: its length.
-        patience_s: how long positions are off, in the mean.
+        step_s: duration of the step [s].
+        patience_s: mean duration of a fault of positions [s].
     """
     step_s = min(step_s, 0.5 * patience_s)
     lengths = SELDOM_S, WILD_S, patience_s
@@ -137,14 +138,14 @@ def mode_changes(step_s: float, patience_s: float) -> np.ndarray:
 def augmented_belief(
     start: Belief, with_share: bool, lasting: Array | None = None, start_m: float | Array = 0.0
 ) -> Belief:
-    """A belief about the navigation state with what the bank adds to it.
+    """Belief about the navigation state, augmented by the states of the bank.
 
     Args:
-        start: at the place of the first fix; sigmas of position S, uncorrelated with the rest.
-        with_share: with a state for what velocities are.
-        lasting: (2,) share of the variance of positions that lasts, and its time constant [s].
-        start_m: the part of S that is not the first fix's. The rest is: where the fix is off by
-            s z, so is the start, by cov(p, z) = -s with s^2 = share (S^2 - start_m^2).
+        start: at the first fix; its position has sigmas S and is uncorrelated with the rest.
+        with_share: with the state `share`.
+        lasting: (2,) correlated share of the variance of positions, and its time constant [s].
+        start_m: the part of S that does not come from the first fix [m]. The error s z of the fix
+            is one of the start too: cov(p, z) = -s with s^2 = share (S^2 - start_m^2).
     """
     mean, sigma = _SHARE
     share = jnp.full(1, mean) if with_share else None
@@ -163,7 +164,7 @@ def augmented_belief(
 
 
 def navigation(x: InsState | AugmentedInsState) -> InsState:
-    """The navigation state of a wide one; another as it is."""
+    """Navigation state within an augmented state; an `InsState` is returned unchanged."""
     return x.ins if isinstance(x, AugmentedInsState) else x
 
 
@@ -175,7 +176,7 @@ def _moved(of: FixHypothesis, x: AugmentedInsState) -> AugmentedInsState:
 def _faded(
     lasting: Array | None, x: AugmentedInsState, u: ImuBlock
 ) -> tuple[AugmentedInsState, Array | None]:
-    """The state with what a step leaves of z, and the share that it leaves."""
+    """State with z decayed over a step, and the decay factor; None without z."""
     if lasting is None or x.lasting is None:
         return x, None
     left = jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
@@ -243,7 +244,7 @@ def _read_fresh(read: Callable, x: InsState, fix: Velocity):
 
 
 def fresh(model: Model) -> Model:
-    """The model whose velocities are those of the fix, whatever window ``aux`` says."""
+    """Model whose velocities are those at the fix, whatever window ``aux`` states."""
 
     def sensor(s: Sensor) -> Sensor:
         read = Partial(_read_fresh, as_data(s.read))
@@ -253,11 +254,11 @@ def fresh(model: Model) -> Model:
 
 
 def hypothesis_model(model: Model, of: FixHypothesis, lasting: Array | None = None) -> Model:
-    """The model of the wide state under a hypothesis.
+    """Model of the augmented state under a hypothesis.
 
     Args:
         model: from `ins_gnss_model`.
-        of: its numbers.
+        of: parameters of the hypothesis.
         lasting: as in `augmented_belief`.
     """
 
@@ -280,7 +281,7 @@ def hypothesis_model(model: Model, of: FixHypothesis, lasting: Array | None = No
 def augmented_case(
     with_share: bool, lasting: tuple[float, float] | None, start_m: float, world: Case
 ) -> Case:
-    """Case of a world whose start is about the navigation state alone, as in `augmented_belief`."""
+    """Case with the start of a world augmented by `augmented_belief`."""
 
     def wide(start: Belief, *numbers: Array) -> Belief:
         return augmented_belief(start, with_share, *numbers)
@@ -293,15 +294,15 @@ def augmented_case(
 
 
 class HindsightVerdict(NamedTuple):
-    """Verdict of a bank on each step, once the whole log is known."""
+    """Smoothed verdict of a bank on each step, given the whole log."""
 
     off: np.ndarray  # (E,) probability that positions are off
-    scale: np.ndarray  # (E,) of the covariance of the process noise, geometric mean
-    diverged: np.ndarray  # (E,) probability that the estimate was off and took the fixes' word
+    scale: np.ndarray  # (E,) factor on the covariance of the process noise, geometric mean
+    diverged: np.ndarray  # (E,) probability that the state was off and was corrected by o
 
 
 def smoothed_probabilities(probability: np.ndarray, change: np.ndarray) -> HindsightVerdict:
-    """Probabilities of the modes given all of a log (Kim 1994, *Dynamic linear models with
+    """Probabilities of the modes given a whole log (Kim 1994, *Dynamic linear models with
     Markov-switching*, J. Econometrics 60, eq. 2.20), backwards from the filtered ones.
 
         P(i at k | all) = P(i at k) sum_j P(j at k+1 | all) p_ij / P(j at k+1 | k)
@@ -324,7 +325,7 @@ def smoothed_probabilities(probability: np.ndarray, change: np.ndarray) -> Hinds
 
 @value
 class Tails(Rule):
-    """The rule of `bounded_student_t`: of a position s R with s = min(1 / weight, heaviest)."""
+    """Rule of `bounded_student_t`: s R for a position, with s = min(1 / weight, heaviest)."""
 
     inner: Rule
     heaviest: Numbers  # ()
@@ -332,7 +333,7 @@ class Tails(Rule):
     name = "tails"
 
     def before(self, memory: Memory, prior: Belief, observation: Observation):
-        """Noise by Student's t, of a position within bounds."""
+        """Scale the noise by Student's t; for a position, within bounds."""
         memory, prior, seen = self.inner.before(memory, prior, observation)
         if observation.sensor == POSITION:
             scale = jnp.minimum(1.0 / seen.notes["student_t.weight"], jnp.asarray(self.heaviest))
@@ -341,17 +342,17 @@ class Tails(Rule):
 
 
 def bounded_student_t() -> Rule:
-    """Student's t on every measurement; of a position no more than `HEAVIEST`.
+    """Student's t on every measurement, bounded by `HEAVIEST` for a position.
 
-    A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
-    every step, would stay likelier than what has to be believed once, and swallow it in the mixing.
+    Large position errors are left to the hypotheses: a mode that explained them by weights, step by
+    step, would stay likelier than a change of mode, and absorb it in the mixing.
     """
-    # the hypotheses are the way out
+    # no patience: the hypotheses handle lasting outliers
     return Tails(student_t(_TAILS, patience=None), np.asarray(HEAVIEST))
 
 
 def single_hypothesis() -> Filter:
-    """A filter of one hypothesis; it can be smoothed."""
+    """Filter of a single hypothesis, which can be smoothed."""
     return kalman(taylor(), [student_t(_TAILS)])
 
 
@@ -362,17 +363,17 @@ def _mode(model: Model, rule: Rule, lasting: Array | None, row: FixHypothesis) -
 
 
 def robust(model: Model, step_s: float, patience_s: float, lasting: Array | None = None) -> Filter:
-    """The bank over the hypotheses, for a model.
+    """Bank of filters over the hypotheses, for a model.
 
     Args:
-        model: from `ins_gnss_model`; the filter runs on `hypothesis_model` of it, from
+        model: from `ins_gnss_model`; the filter runs on its `hypothesis_model`, from
             `augmented_belief`.
-        step_s: between fixes, or of the longest block where that is shorter.
-        patience_s: how long positions are off where they are, in the mean.
+        step_s: interval of fixes [s], or the longest block if that is shorter.
+        patience_s: mean duration of a fault of positions [s].
         lasting: as in `augmented_belief`.
     """
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
-    # a position that may be off by `OFF_M` is seldom expected, and would hide what is
+    # innovations are the likeliest mode's: the large sigma of a rare fault mode would hide others
     make = Partial(_mode, model, bounded_student_t(), lasting)
     return bank(make, _ROWS, mode_changes(step_s, patience_s), start, likeliest=True)

@@ -1,8 +1,8 @@
 """Positions and attitudes at every inertial sample of a replay, on request.
 
-Between two epochs a state is that of the earlier one, carried over the samples since; at an epoch
-it is the epoch's own. So a causal filter uses nothing of the future, and a smoother no more of it
-than its epochs do.
+Between two epochs the state is that of the earlier one, propagated by the samples since; at an
+epoch it is that of the epoch. So a causal filter uses no future data, and a smoother no more than
+its epochs do.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from robins.systems.replaying import FilterEstimates, LogPiece
 def at_samples(
     time_s: np.ndarray, pieces: Sequence[LogPiece], mean: InsState
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (K,) and rows (K, 10), as `mechanise.vector` has them, at the samples of all pieces.
+    """Times (K,) [s] and states (K, 10), as in `mechanise.vector`, at the samples of all pieces.
 
     Args:
-        time_s: (N,) of the samples of the log.
-        pieces: E epochs in all, whose worlds are a `Case` with blocks of increments.
-        mean: leading axis E and a row between two pieces, as `replaying.end_to_end` joins them.
+        time_s: (N,) of the samples of the log [s].
+        pieces: with worlds of type `Case`, whose inputs are blocks of increments.
+        mean: at the epochs of all pieces, as joined by `replaying.end_to_end`.
     """
     times, rows, first = [], [], 0
     for piece in pieces:
@@ -49,7 +49,7 @@ def at_samples(
         last = np.argmax(ends, axis=1)
         found[np.arange(count), last] = np.asarray(vector(own.nav))
         near = np.clip(np.searchsorted(time_s, ends - 1e-6), 0, len(time_s) - 1)
-        real = np.abs(time_s[near] - ends) < 1e-6  # no part of a sample that an epoch splits
+        real = np.abs(time_s[near] - ends) < 1e-6  # exclude parts of a sample split by an epoch
         times.append(time_s[near[real]])
         rows.append(found[real])
     return np.concatenate(times), np.concatenate(rows)
@@ -65,10 +65,10 @@ def as_files(
     pieces: Sequence[LogPiece],
     answers: Mapping[str, FilterEstimates],
 ) -> dict[str, bytes]:
-    """A file NAME-sample.npz for each filter, by its path in the result.
+    """Files NAME-sample.npz of each filter, by path in the result.
 
-    It holds `time_ns` (K,) int64, the stamps of the log, and float64 arrays `q_nb` (K, 4), body FRD
-    to NED, scalar first, `v_n` (K, 3) m/s, `lat_rad`, `lon_rad` and `alt_m` (K,) of the IMU.
+    Each holds `time_ns` (K,) int64, the stamps of the log, and float64 arrays `q_nb` (K, 4), body
+    FRD to NED, scalar first, `v_n` (K, 3) m/s, `lat_rad`, `lon_rad` and `alt_m` (K,) of the IMU.
     """
     files = {}
     for name, answer in answers.items():

@@ -1,4 +1,4 @@
-"""Start of a replay: rest or motion, tilt, heading and velocity."""
+"""Start of a replay: levelling, heading and initial velocity, at rest or in motion."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from robins.systems.ins_gnss.positions import (
 from robins.systems.ins_gnss.recording import Log
 from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, at_rest, usual_of
 
-REST_S = 10.0  # after the first whole fix, within which a filter with a given heading levels
-UNKNOWN_SPEED = 10.0  # m/s, sigma of a velocity of which nothing is known
+REST_S = 10.0  # after the first complete fix, within which a filter with a given heading levels
+UNKNOWN_SPEED = 10.0  # m/s, sigma of an unknown velocity
 
 
 class StartPoint(NamedTuple):
     """First fix of the filter, with attitude and velocity there."""
 
-    fix: int  # row of the whole fix that it begins at
+    fix: int  # row of the complete fix at which the filter starts
     q_nb: np.ndarray  # (4,)
     tilt_sigma_rad: float
     gyro_bias: np.ndarray  # (3,) rad/s, mean rate of a standstill, else zero
-    sentence: str  # how it was found, for the reader
+    sentence: str  # how the start was found, for the report
     heading_sigma_rad: float
-    v_n: np.ndarray  # (3,) m/s, of the antenna where the receiver states it
-    # (3, 2, 2) of velocity and position on each axis; None: as `InsGnssStart` has them
+    v_n: np.ndarray  # (3,) m/s; of the antenna if stated by the receiver
+    # (3, 2, 2) covariance of velocity and position on each axis; None: from `InsGnssStart`
     spread: np.ndarray | None = None
-    offset_n: np.ndarray | None = None  # (3,) m, IMU from the fix; None: by lever arm and attitude
+    offset_n: np.ndarray | None = None  # (3,) m, IMU from the fix; None: from the lever arm
 
 
 def fast_fix(log: Log, start: InsGnssStart) -> tuple[int | None, bool, str]:
-    """First fix that a course can be taken from, and whether by positions; None and why, else."""
+    """First fix with a course, and True if that is from positions; else None, and the reason."""
     v_n = log.gnss.v_n
     speed = np.zeros(len(log.gnss_s)) if v_n is None else np.hypot(v_n[:, 0], v_n[:, 1])
     usable = np.flatnonzero((speed >= start.course_speed) & (log.gnss_s > log.time_s[0]))
@@ -69,16 +69,16 @@ def fast_fix(log: Log, start: InsGnssStart) -> tuple[int | None, bool, str]:
 def _compass(
     log: Log, q_nb: np.ndarray, when_s: float, fix: int, otherwise: str
 ) -> tuple[float, str]:
-    """Heading [rad] by the magnetometer over the second before a time, and a sentence.
+    """Heading [rad] by the magnetometer within a second of a time, and a sentence.
 
-    The declination is that of the World Magnetic Model, of today where the stamps are no date.
+    The declination is that of the World Magnetic Model, for 2025 if the stamps are no date.
 
     Args:
         log: with a magnetometer.
         q_nb: (4,) levelled, at heading zero.
-        when_s: the time.
-        fix: number of one near by.
-        otherwise: why there is no other heading.
+        when_s: the time [s].
+        fix: row of a fix nearby.
+        otherwise: reason why there is no other heading.
 
     Raises:
         ValueError: the field is not that of the Earth.
@@ -117,22 +117,22 @@ def find_start(
 ) -> StartPoint:
     """Level on the quietest early window; take the heading as given or from the course.
 
-    The gyros carry the tilt from that window to the moment the course is known, by the first fix
-    faster than ``start.course_speed`` or by positions (`course_fix`); body forward is then along
-    the course. A heading that is given is that at the first sample, and the window ends `REST_S`
-    after the first whole fix. The filter begins at the first whole fix from there on with a known
-    velocity. Where no fix is fast enough a magnetometer is used, if there is one.
+    The gyros propagate the tilt from that window to the time at which the course is known, from the
+    first fix faster than ``start.course_speed`` or from positions (`course_fix`); body forward is
+    then along the course. A given heading is that at the first sample, and the window ends
+    `REST_S` after the first complete fix. The filter starts at the first complete fix from then on
+    with a known velocity. If no fix is fast enough, a magnetometer is used, if there is one.
 
     Args:
-        log: at least up to that moment.
-        start: how well it is known.
-        aids: what rest is.
-        usual: where the log is too short to tell.
-        gnss: lever arm and latency; None: none.
+        log: at least up to that time.
+        start: parameters of the start.
+        aids: limits of rest.
+        usual: intervals, if the log is too short to find them; None: found from the log.
+        gnss: lever arm and latency; None: both zero.
 
     Raises:
         ValueError: no heading is known, nor a magnetometer that reads the Earth's field; there is
-            no whole fix, or none after that moment; or the mean force is not gravity's.
+            no complete fix, or none after that time; or the mean specific force is not gravity.
     """
     usual, gnss, g = usual or usual_of(log), gnss or Gnss(), log.gnss
     whole = _whole_fixes(log)
@@ -174,7 +174,7 @@ def find_start(
 
 
 def _whole_fixes(log: Log) -> np.ndarray:
-    """Rows of fixes with three coordinates, within the time of the increments.
+    """Rows of complete fixes (three coordinates) within the time of the increments.
 
     Raises:
         ValueError: there is none.
@@ -195,20 +195,20 @@ def _levelled(
     fast: int | None,
     until_s: float,
 ) -> tuple[int, int, np.ndarray, float, np.ndarray, str]:
-    """Level on rest, or on the quietest second, of the samples up to a time or a fast fix.
+    """Level at rest, or on the quietest second, of the samples up to a time or a fast fix.
 
     Returns:
-        Row of the increment there, row of the last one looked at, attitude (4,) of heading zero,
-        sigma of its tilt [rad], (3,) gyro bias [rad/s], and a sentence.
+        Row of the increment there, row of the last one considered, attitude (4,) with heading zero,
+        sigma of its tilt [rad], gyro bias (3,) [rad/s], and a sentence.
 
     Raises:
-        ValueError: the mean specific force is not gravity's.
+        ValueError: the mean specific force is not gravity.
     """
     dt, _, dv = log.increments[:3]
     still, mean_rate = at_rest(log, aids, usual, lenient=True)
     width = max(2, round(2.0 * aids.window / usual.sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
-    # without a course nothing is taken from after the rest that it begins at
+    # without a course nothing after the first rest is used
     end = min(int(np.searchsorted(log.time_s, until_s)), len(dt) - 1)
     enough = min(int(np.append(np.flatnonzero(still)[width : width + 1], end)[0]), end)
     last = enough if fast is None else _row(log, fast)
@@ -233,7 +233,7 @@ def _levelled(
 
 
 def _carried(log: Log, q_nb: np.ndarray, at: int, to: int, bias: np.ndarray) -> np.ndarray:
-    """Attitude (4,) carried by the gyros from the end of one increment to that of another."""
+    """Attitude (4,) propagated by the gyros from the end of one increment to that of another."""
     low, high = min(at, to) + 1, max(at, to) + 1
     theta = log.increments.theta[low:high] - bias * log.increments.dt[low:high, None]
     theta = theta if to > at else -theta[::-1]
@@ -241,7 +241,7 @@ def _carried(log: Log, q_nb: np.ndarray, at: int, to: int, bias: np.ndarray) -> 
 
 
 def _course(heading: float, at_s: float, speed: float, by: str) -> str:
-    """Words of the sentence on a start."""
+    """Part of the sentence on a start: heading and source of the course."""
     return (
         f"; heading {np.degrees(heading) % 360:.1f} deg from the course{by} at {at_s:.1f} s, "
         f"when the speed reached {speed:.2f} m/s"
@@ -258,12 +258,12 @@ def _by_positions(
     gnss: Gnss,
     by_way: bool,
 ) -> StartPoint:
-    """Begin at the first of some whole fixes at which the velocity is known.
+    """Start at the first of some complete fixes at which the velocity is known.
 
-    It is that of the receiver; else zero, where the vehicle certainly stands; else that of a line
-    through the positions. Where there is none within 32 s, it is 0 +- `UNKNOWN_SPEED`. The attitude
-    of `level_` is that at the end of increment `at`; `later` (K,) are rows of whole fixes, `stands`
-    (K,) is rest at them, and with `by_way` the course is that of the positions.
+    It is that of the receiver; else zero at certain rest; else that of a line through the
+    positions. If there is none within 32 s, it is 0 +- `UNKNOWN_SPEED`. The attitude of `level_` is
+    that at the end of increment `at`; `later` (K,) are rows of complete fixes, `stands` (K,) is
+    true at rest, and with `by_way` the course is that of the positions.
 
     Raises:
         ValueError: the log ends before the velocity is known.
@@ -294,7 +294,7 @@ def _by_positions(
         sentence += _course(float(np.arctan2(v[1], v[0])), log.gnss_s[fix], speed, " of positions")
     else:
         sentence += f"; velocity from positions, {speed:.2f} +- {sigma:.2f} m/s"
-    # what the receiver states is better than a line
+    # a stated velocity is better than that of a line
     for axis in np.flatnonzero(own):
         spread[axis] = np.diag([start.velocity**2, spread[axis, 1, 1]])
     return found._replace(

@@ -1,4 +1,4 @@
-"""The study "drive": filters, what each believes, what is reported of them and what is claimed."""
+"""Study "drive": filters and their assumptions, report and claims."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FILTERS = {
     "ckf": lambda rules: kalman(cubature(), rules),
 }
 SMOOTHERS = {f"{name}+rts": name for name in FILTERS}
-"""Of recorded logs, by name: the filter whose run each smooths."""
+"""Smoothers of recorded logs: name -> name of the filter whose run it smooths."""
 
 # a bank over the process noise; nothing is gated, and nothing can be smoothed
 ADAPTIVE = "adaptive"
@@ -44,11 +44,11 @@ CLAIMS = consistency_claims(
         "nis": "The grand mean NIS of every sensor is inside its 99.9 % band",
     }
 )
-"""With several filters, of the worst of them."""
+"""Claims on the worst of the filters."""
 
 
 def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
-    """The filter of a name, gated where the probability is not zero; "adaptive" never is.
+    """Filter by name, gated unless the probability is zero; "adaptive" is never gated.
 
     Raises:
         ValueError: there is no filter of this name.
@@ -60,7 +60,7 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
 
 
 def believed_imu(drive: Drive) -> InsGnssImu:
-    """The inertial sensors as the filters believe in them: their noise by `believed.q_factor`."""
+    """Inertial sensors as assumed by the filters: noise scaled by sqrt(`believed.q_factor`)."""
     factor = float(np.sqrt(drive.believed.q_factor))
     scaled = ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
     return drive.imu.model_copy(
@@ -69,7 +69,7 @@ def believed_imu(drive: Drive) -> InsGnssImu:
 
 
 def contender(drive: Drive, course: InsGnssCourse, name: str) -> Contender:
-    """A filter with the model it believes in.
+    """A filter with its model, by name.
 
     Raises:
         ValueError: it is a smoother, or there is no filter of this name.
@@ -82,10 +82,10 @@ def contender(drive: Drive, course: InsGnssCourse, name: str) -> Contender:
 
 
 def view(drive: Drive, course: InsGnssCourse) -> View:
-    """Arrays of the report: all states, the true path, the track of each filter in the first run.
+    """Report of all states, the true path, and the track of each filter in the first run.
 
     Raises:
-        ValueError: `settle` leaves nothing to count.
+        ValueError: `settle` is not before the end of the run.
     """
     epoch_s, blocks = course.blocks.epoch_s, state_blocks(drive.imu.scale_states)
     refuse_unsettled("settle", drive.settle, float(epoch_s[-1]) + 1e-9)
@@ -100,14 +100,14 @@ def view(drive: Drive, course: InsGnssCourse) -> View:
         context=xr.Dataset(context),
         shown=lambda means: track_arrays(mean.position for mean in means.values()),
         count_from=int(np.searchsorted(epoch_s, drive.settle)),
-        faults={},  # the errors of the sensors are drawn from what filters believe
+        faults={},  # no faults: sensor errors are drawn from the filters' model
     )
 
 
 def _metrics(
     outage: np.ndarray, blocks: Sequence[StateBlock], statistics: Any
 ) -> dict[str, Metric]:
-    """RMS errors over runs and epochs, with GNSS and without; consistency; runs that diverged."""
+    """RMS errors over runs and epochs, with and without GNSS; consistency; diverged runs."""
     rms = statistics.rms[statistics.count_from :]
     aided = ~outage[statistics.count_from :]
     where = {b.name: b.where for b in blocks}
@@ -134,5 +134,5 @@ def _metrics(
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
-# smoothers are named so that a campaign asked for one is told where it belongs
+# smoothers are listed so that a campaign that requests one gets an error pointing to the replay
 DRIVE = Study(Drive, NAMES, simulate, contender, view, lay_out, CLAIMS)

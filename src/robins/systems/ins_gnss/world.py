@@ -1,8 +1,8 @@
 """A simulated drive: one true motion, any number of runs with their own sensor errors.
 
-The truth of a run is drawn from what the filter is told: initial errors from its initial
-covariance, biases and noise from its IMU parameters, fixes from its GNSS sigmas. So a right filter
-is consistent, and `Believed` makes it wrong on purpose.
+The truth of a run is drawn from the assumptions of the filter: initial errors from its initial
+covariance, biases and noise from its IMU parameters, fixes from its GNSS sigmas. A correct filter
+is therefore consistent, and `InsGnssAssumptions` makes it wrong on purpose.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class InsGnssCourse(NamedTuple):
     """Data that all runs share."""
 
     motion: MotionProfile
-    ideal: Increments  # (N,), (N, 3), (N, 3) the samples of an ideal unit
-    blocks: Blocks  # of the same with coning and sculling in them
+    ideal: Increments  # (N,), (N, 3), (N, 3) samples of an ideal unit
+    blocks: Blocks  # of the same, with coning and sculling compensated
     start: Nav
     truth: Nav  # at each epoch, leading axis E
-    sample: np.ndarray  # (E,) the one that ends at each epoch
+    sample: np.ndarray  # (E,) index of the sample that ends at each epoch
     rate_b: np.ndarray  # (E, 3) rad/s true gyro rate at each epoch
-    at_fix: tuple[np.ndarray, ...]  # the truth at each fix, as `observe` takes it
-    fix: np.ndarray  # (E,) number of the fix at each epoch, -1 where there is none
+    at_fix: tuple[np.ndarray, ...]  # the truth at each fix: arguments of `observe`
+    fix: np.ndarray  # (E,) index of the fix at each epoch, -1 if none
     outage: np.ndarray  # (E,) bool
 
 
@@ -63,7 +63,7 @@ def motion_of(drive: Drive) -> MotionProfile:
 
 
 def error_model(imu: InsGnssImu) -> ImuErrorModel:
-    """The sensors whose errors the filter's parameters describe."""
+    """Error model of the sensors that the filter's parameters describe."""
 
     def triad(bias, noise, walk, time, scale) -> TriadErrors:
         given: dict[str, Any] = {"white": as_array(noise)}
@@ -83,7 +83,7 @@ def error_model(imu: InsGnssImu) -> ImuErrorModel:
 
 
 def receiver_model(drive: Drive) -> GnssErrorModel:
-    """The receiver; outages are left to the epochs."""
+    """Error model of the receiver, without outages, which are applied to the epochs."""
     g = drive.gnss
     return GnssErrorModel(
         sigma_m=as_array(g.sigma),
@@ -95,7 +95,7 @@ def receiver_model(drive: Drive) -> GnssErrorModel:
 
 
 def lay_out(drive: Drive) -> InsGnssCourse:
-    """Everything that does not depend on a run, in NumPy.
+    """Compute, in NumPy, all that does not depend on the run.
 
     Raises:
         ValueError: the legs are too short for two fixes.
@@ -113,7 +113,7 @@ def lay_out(drive: Drive) -> InsGnssCourse:
     stamps = times.stamp_s
     if len(stamps) < 2:
         raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
-    # what comes after the last fix would end on no sample, so the run ends with the fix
+    # blocks after the last fix would not end on a sample, so the run ends with the fix
     epochs = epochs_between(0.0, float(stamps[-1]), stamps, drive.update.longest_block)
     blocks = cut(compensated, time_s, 0.0, epochs)
     start = nav_at(trajectory, 0, np)
@@ -144,17 +144,17 @@ def lay_out(drive: Drive) -> InsGnssCourse:
 
 
 def _at_fixes(motion: MotionProfile, valid_s: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The truth at some times, as `observe` takes it."""
+    """Truth at times of validity: arguments of `observe`."""
     k = motion.at(valid_s)
     return valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]
 
 
 def simulate(drive: Drive, course: InsGnssCourse, seed: int, index: Array) -> Case:
-    """One run, from its number; pure."""
+    """Simulate the run of this number; pure."""
     dt, theta, dv = (jnp.asarray(a) for a in course.ideal[:3])
     key = partial(stream, seed, index)
     turned, pushed, errors = corrupt(dt, theta, dv, error_model(drive.imu), key(Component.IMU))
-    # the part of each piece in its parent sample is the same for all runs
+    # the share of each piece in its parent sample is the same for all runs
     parent, padded = course.blocks.parent, course.blocks.parent < 0
     share = course.blocks.increments.dt / np.asarray(course.ideal.dt)[parent]
     share = jnp.asarray(np.where(padded, 0.0, share))[..., None]
@@ -209,14 +209,14 @@ def simulate(drive: Drive, course: InsGnssCourse, seed: int, index: Array) -> Ca
 
 
 class DriveBelief(NamedTuple):
-    """Assumptions of filters about any drive."""
+    """Initial covariance and measurement sigmas assumed by the filters."""
 
-    factor: Array  # of the covariance at the start
+    factor: Array  # of the initial covariance
     sigma: dict[str, Any]  # by sensor
 
 
 def belief_of(drive: Drive, course: InsGnssCourse) -> DriveBelief:
-    """Assumptions of the filters, by the parameters."""
+    """Assumptions of the filters from the parameters."""
     begin = drive.start
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
     r, g = np.sqrt(drive.believed.r_factor), drive.gnss
@@ -225,7 +225,7 @@ def belief_of(drive: Drive, course: InsGnssCourse) -> DriveBelief:
 
 
 def as_believed(belief: DriveBelief, world: Case) -> Case:
-    """The case of a drive, which may have been drawn with other numbers than filters are told."""
+    """Case of a drive, with the assumptions of the filters in place of the true sigmas."""
     aux = {
         name: fix._replace(sigma=jnp.broadcast_to(belief.sigma[name], fix.sigma.shape))
         for name, fix in world.aux.items()

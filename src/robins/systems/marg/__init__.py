@@ -1,4 +1,4 @@
-"""Orientation from gyro, accelerometer and magnetometer (MARG), for logs of cheap units."""
+"""Orientation from gyro, accelerometer and magnetometer (MARG), for logs of low-cost units."""
 
 from pathlib import Path
 

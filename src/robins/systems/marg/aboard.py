@@ -1,12 +1,12 @@
-"""The filter "marg" for a board: its step takes increments, and a simulated hand tries it.
+"""The filter "marg" for embedded use: its step takes increments; a simulated hand tests it.
 
 A log has no scenario, so the run that `robins export` records and judges is simulated here: a unit
-that lies still for two seconds and is then turned and swung by a hand, read with the errors that
-the parameters of the unit allow, in a field that a magnet disturbs twice. From its samples to the
-first belief all goes the way of a log (`prepare`).
+that lies still for two seconds and is then turned and swung by a hand, with sensor errors as large
+as the parameters of the unit state, in a field that a magnet disturbs twice. Samples are processed
+up to the first belief as those of a log (`prepare`).
 
-On the board a step takes the increments of a block as they come, and the code integrates them by
-`model.of_block`, as a replay does beforehand. It is the filter of one prior: on a board the gains
+On the board a step takes the increments of a block, and the code integrates them by
+`model.of_block`, as a replay does beforehand. The filter has a single prior: on a board the gains
 of the gyros are known, or found in a log (`filters.filter_of`).
 """
 
@@ -34,13 +34,13 @@ from robins.systems.parts import NED
 from robins.systems.study import Case, Contender, Problem, StateBlock
 
 RATE_HZ, SECONDS, RUNS = 100.0, 40.0, 3
-STILL_S, BEGUN_S, COUNTED_S = 2.0, 3.0, 10.0  # at rest until; moves fully; errors count from
-MAGNET_S = ((4.0, 5.0), (20.0, 24.0))  # a magnet is near
+STILL_S, BEGUN_S, COUNTED_S = 2.0, 3.0, 10.0  # end of rest; full motion from; errors count from
+MAGNET_S = ((4.0, 5.0), (20.0, 24.0))  # intervals with a magnet near the unit
 MAGNET_N = np.array([12e-6, -20e-6, 8e-6])  # T
-FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, north is where it points
-SHAKE = 0.1  # of what is believed of the field, noise of a reading
+FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, NED; north is its horizontal direction
+SHAKE = 0.1  # noise of a reading, as a share of the assumed `magnetometer.noise`
 
-PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the middle of its places
+PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the centre of its motion
 _LEARNED = {"ratio": "learned variances, 1 as given", "samples": "that they were learned from"}
 _GATE = {"refused": "readings refused in a row", "ratio": "of the last one, 1 at the gate"}
 
@@ -74,7 +74,7 @@ FIELDS = {
 
 
 class BoardInput(NamedTuple):
-    """Input of a step: n increments, and what is known of them."""
+    """Input of a step: n increments, with rest flag and uncertainty of missing samples."""
 
     dt_s: Any  # (n,)
     theta_b: Any  # (n, 3) rad, rotation vector of each interval
@@ -85,7 +85,7 @@ class BoardInput(NamedTuple):
 
 
 def block_of(u: BoardInput) -> model.Block:
-    """The increments, integrated."""
+    """Integrate the increments."""
     field = jnp.full(jnp.shape(u.theta_b), jnp.nan)
     integrals, _ = model.of_block(model.Samples(u.dt_s, u.theta_b, u.dv_b, field))
     return model.Block(integrals, u.still, u.lost_turn, u.lost_dv)
@@ -96,7 +96,7 @@ def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: BoardInp
 
 
 def model_on_board(parameters: MargReplay) -> Model:
-    """`model_of`, whose motion takes `BoardInput`."""
+    """Model of `model_of`, with a motion that takes `BoardInput`."""
     known = model.model_of(parameters)
     step, noise, linear = (
         Partial(_of_increments, part)
@@ -109,12 +109,11 @@ def model_on_board(parameters: MargReplay) -> Model:
 
 
 def simulated_hand(parameters: MargReplay, seed: int, run: int) -> tuple[Dataset, model.MargState]:
-    """A hand that turns and swings the unit; each run in another way, with other errors.
+    """Simulated log of a unit turned and swung by hand, and the truth at each sample.
 
-    A simulated log, and the truth at each of its samples.
-
-    Samples are means over the intervals that they end. What is believed of the unit is the size of
-    its errors: biases within their spreads, gains and noises as normal numbers.
+    Each run has its own motion and errors. Samples are means over the intervals that they end.
+    Errors have the sizes that the parameters state: biases uniform within plus or minus sigma,
+    gains and noises normal.
     """
     p, rng, dt = parameters, np.random.default_rng((seed, run)), 1.0 / RATE_HZ
     time = np.arange(round(SECONDS * RATE_HZ) + 1) * dt
@@ -144,7 +143,7 @@ def simulated_hand(parameters: MargReplay, seed: int, run: int) -> tuple[Dataset
     accel = middle.inv().apply(push) + accel_bias + noise(p.accelerometer.noise / np.sqrt(dt))
     time_ns = np.round(time * 1e9).astype(np.int64)
 
-    def rows(values: np.ndarray) -> np.ndarray:  # nothing is made of the first
+    def rows(values: np.ndarray) -> np.ndarray:  # the first sample is not used
         return np.concatenate([values[:1], values])
 
     imu = ImuTable(time_ns, rows(gyro), rows(accel), "rate")
@@ -157,7 +156,7 @@ def simulated_hand(parameters: MargReplay, seed: int, run: int) -> tuple[Dataset
 
 
 def case_of(parameters: MargReplay, log: Dataset, truth: model.MargState) -> Case:
-    """Inputs and measurements of a filter on a board, and the truth at the ends of its steps."""
+    """Inputs and measurements of the embedded filter, and the truth at the ends of its steps."""
     made: PreparedMargLog = prepare(log, parameters)
     world, samples = made.world, made.samples
     u = BoardInput(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
@@ -166,10 +165,10 @@ def case_of(parameters: MargReplay, log: Dataset, truth: model.MargState) -> Cas
 
 
 def export_problem(parameters: MargReplay, seed: int) -> Problem:
-    """The filter on some simulated hands, as `robins export` takes it.
+    """Problem of `robins export`: the filter on several simulated logs.
 
     Raises:
-        ValueError: the parameters allow no log of such a hand.
+        ValueError: the simulated logs cannot be prepared with these parameters.
     """
     cases = [case_of(parameters, *simulated_hand(parameters, seed, run)) for run in range(RUNS)]
     every = jax.tree_util.tree_map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *cases)

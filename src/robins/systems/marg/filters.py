@@ -1,4 +1,4 @@
-"""The filter of a nine-axis unit: learnt noise, gates and hypotheses."""
+"""Filter of a nine-axis unit: adaptive noise, gates and hypotheses."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from robins.filters.values import Numbers, number, value
 from robins.systems.marg import model
 from robins.systems.marg.parameters import MargReplay
 
-# of what is learned of travel: forgetting, and least and most of its variances
+# adaptation of the travel noise: forgetting factor, least and largest variance ratio
 _MEMORY, _TRAVEL_VARIANCE = 0.98, (0.3, 10.0)
-# the same of the field: within that of a room, or as an uncalibrated unit reads it
+# the same of the field: from that of a room to that read by an uncalibrated unit
 _FIELD_MEMORY, _FIELD_VARIANCE = 0.95, (1.0, 16.0)
 _TAILS = 4.0  # degrees of freedom of Student's t
-_NATS = 40.0  # for a bare chip; errors of travel last for some looks, so they count several times
-BARE = "gyro_gain"  # what is found wrong where the gyros are those of a bare chip
+_NATS = 40.0  # evidence for a bare chip; travel errors are correlated, so it counts several times
+BARE = "gyro_gain"  # suspect: the gyros are those of an uncalibrated chip
 
 
 def field_forgotten(prior: Belief, field_t: Numbers | float) -> Belief:
-    """Belief that knows nothing of the field any more, and all else as before.
+    """Belief with the field and its declination forgotten, and all other states unchanged.
 
-    The heading too: the gyros know it better than a field that has changed. That the declination of
-    a place is small on the long run then leads the heading to the new field in some minutes.
+    The heading is kept: the gyros know it better than a field that has changed. As the declination
+    decays, the heading follows the new field within minutes.
     """
     forgotten = jnp.zeros(prior.factor.shape[0]).at[model.DECLINATION].set(math.pi)
     forgotten = forgotten.at[model.FIELD].set(field_t)
@@ -42,7 +42,7 @@ def field_forgotten(prior: Belief, field_t: Numbers | float) -> Belief:
 
 @value
 class Undisturbed(Rule):
-    """The rule of `undisturbed`: a gate that forgets the field where it recovers."""
+    """Rule of `undisturbed`: a gate that forgets the field when it recovers."""
 
     gate: Rule
     field_t: Numbers  # () T
@@ -54,24 +54,24 @@ class Undisturbed(Rule):
         return self.gate.init(belief, dims)
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Judge a measurement as the gate does, but for the prior where it recovers."""
+        """Gate a measurement; on recovery, replace the prior by `field_forgotten`."""
         memory, reopened, o = self.gate.before(memory, prior, o)
         new = o.notes["gate.recovered"]
         return memory, select(new, field_forgotten(prior, self.field_t), Belief(*reopened)), o
 
 
 def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
-    """Refuse a magnetic field that is not the one known, until it has proved to be the field.
+    """Refuse a magnetic field other than the known one, until it has persisted.
 
-    A chi-square gate on azimuth, strength and vertical component together. Refusals that agree with
-    each other while the unit moves, ``patience`` in a row, are the field of a new place, or the
-    first was disturbed: what was known of the field is then forgotten and learned from it
-    (`field_forgotten`). What sits on the unit turns with it and does not agree.
+    A chi-square gate on azimuth, strength and vertical component together. ``patience`` consecutive
+    refusals that agree with each other while the unit moves mean a new place, or that the first
+    field was disturbed: the known field is then forgotten and learned again (`field_forgotten`). A
+    disturbance fixed to the unit turns with it, so such refusals do not agree.
 
     Args:
-        probability: share of right measurements that pass.
-        patience: refusals in a row.
-        field_t: T, spread of strength and vertical component after forgetting.
+        probability: share of undisturbed measurements that pass.
+        patience: consecutive refusals.
+        field_t: T, sigma of strength and vertical component after forgetting.
     """
     gate = rules.gate(probability, patience, "reinitialise")
     spread = number("field_t must be a number", field_t)
@@ -81,23 +81,23 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
 def marg_filter(
     gate: float | None = 0.95, patience: int = 20, field_t: float = 1e-4, sites: bool = True
 ) -> Filter:
-    """The filter of `marg.model_of`, for one prior.
+    """Filter of `marg.model_of`, for one prior.
 
-    How far the unit travels, and how much the field of its places scatters, is learned: no constant
-    is right for a hand and a flight, or for a unit that was calibrated and one that was not.
+    The noise of travel and of the field is estimated: no constant suits both a hand and a flight,
+    or both a calibrated and an uncalibrated unit.
 
     Args:
-        gate: share of right magnetometer readings that pass; None believes every reading, and is
-            for a model without a magnetometer too.
-        patience: readings refused in a row before a field that stays is taken up.
-        field_t: T, spread of strength and vertical component of a new field.
-        sites: the model reads sites.
+        gate: share of undisturbed magnetometer readings that pass; None accepts every reading, and
+            also suits a model without a magnetometer.
+        patience: consecutive refused readings before a persisting field is adopted.
+        field_t: T, sigma of strength and vertical component of a new field.
+        sites: the model has the sensor "revisit".
     """
     tails = rules.student_t(_TAILS, patience=None)
     chain = [
         rules.only(model.TRAVEL, rules.sage_husa(_MEMORY, "R", *_TRAVEL_VARIANCE)),
         rules.only(model.TRAVEL, tails),
-        # assumptions, which may be wrong for long: time does not make them right
+        # a pseudo-measurement may be wrong for long: waiting does not make it right
         rules.only(model.REST, rules.gate(0.9999, 100, "accept")),
     ]
     if gate is not None:
@@ -113,7 +113,7 @@ def marg_filter(
 
 
 def one_prior(parameters: MargReplay) -> Filter:
-    """The filter, with its rules, for gyros of the gain `parameters.gyro.gain`."""
+    """Filter with its rules, for gyros whose gain errors have the sigma `parameters.gyro.gain`."""
     m, sees = parameters.magnetometer, parameters.use_magnetometer
     return marg_filter(
         gate=m.gate if sees == "undisturbed" else None,
@@ -124,7 +124,7 @@ def one_prior(parameters: MargReplay) -> Filter:
 
 
 def filter_of(parameters: MargReplay) -> Filter:
-    """The filter of a log, which takes gyros for those of a bare chip once that is likelier."""
+    """Filter of a log; widens the prior of the gyro gains once an uncalibrated chip is likelier."""
     gyro, spread = parameters.gyro, np.zeros(model.DIM)
     spread[model.GAINS] = gyro.bare_gain
     return alternative(one_prior(parameters), spread, [model.TRAVEL], _NATS, BARE)

@@ -1,20 +1,21 @@
-"""The orientation of a unit while it moves: one sample in, its attitude out at once.
+"""Live orientation: each sample is answered at once with the attitude at its stamp.
 
-`LiveMarg` is the filter "marg" of a replay: both take their samples through `marg.path`, in chunks
-of one sample here. What the path waits for shows in the flags of an answer:
+`LiveMarg` is the filter "marg" of a replay: both take their samples through `marg.path`, here in
+chunks of one sample. Its latencies show in the flags of an answer:
 
 - `STARTING`, without numbers: the start is not known. Samples are kept, and the filter then takes
-  two blocks a sample until it has caught up. From there on the answers are those of the replay.
-- `BEHIND`: a block waits for the flank of a peak that a gyro cut off, or for the stamp after a long
-  interval; until then the gyros carry the attitude on as they read.
+  two blocks per sample until it has caught up. From there on the answers are those of the replay.
+- `BEHIND`: a block waits for the far flank of a clipped gyro peak, or for the stamp after a long
+  interval; until then the attitude is propagated by the gyros as they read.
 
-What differs from a replay of the whole log:
+Differences from a replay of the whole log:
 
-- The ends of the ranges of gyros are those that the samples so far show, where `gyro.range` does
-  not state them.
-- A gap of more than ten seconds, or a clock that was set, is a new start; a replay bridges it.
-- `DOUBTFUL` is set when the monitor knows it. It marks the looks that led to it in a replay.
-- True north is given with the object (`declination_rad`); a replay takes it from the fixes.
+- The ends of the ranges of gyros are found from the samples so far, unless `gyro.range` states
+  them.
+- A gap of more than ten seconds, or a clock that was set, causes a new start; a replay bridges it.
+- `DOUBTFUL` is set once the monitor detects a contradiction. A replay also marks the measurements
+  that led to it.
+- True north is given to the object (`declination_rad`); a replay takes it from the fixes.
 """
 
 from __future__ import annotations
@@ -54,23 +55,23 @@ from robins.systems.streaming import (
 )
 from robins.systems.tables import SensorUpdates
 
-_STEPS = 2  # of the filter in a sample, where it has to catch up
+_STEPS = 2  # most filter steps per sample, while it catches up
 _LONGEST_GAP_S, _PATIENCE_S = 10.0, 0.1
-_FAR = 10  # implausible fields in a row whose unit is looked at
-_MONITORED_S = 60.0  # of looks, that the monitor is shown
+_FAR = 10  # implausible fields in a row after which their unit is checked
+_MONITORED_S = 60.0  # window of the monitor
 
 
 class Attitude(NamedTuple):
-    """The answer to a sample."""
+    """Answer to a sample."""
 
     time_ns: int
     q_nb: np.ndarray  # (4,) body to NED, scalar first; NaN while `STARTING`
-    sigma_rad: np.ndarray  # (3,) about north, east, down, as of the last step of the filter
+    sigma_rad: np.ndarray  # (3,) about north, east, down, at the last step of the filter
     flags: Flag
 
 
 class _Step(NamedTuple):
-    """Numbers of a step that are read."""
+    """Results of a filter step that the live object reads."""
 
     q_nb: np.ndarray  # (4,)
     gyro_bias: np.ndarray  # (3,)
@@ -78,16 +79,16 @@ class _Step(NamedTuple):
     declination: np.ndarray  # (1,)
     sigma: np.ndarray  # (DIM,)
     code: np.ndarray  # (1,) of the prediction
-    bare: np.ndarray  # (1,) 1 where the gyros are taken for those of a bare chip
+    bare: np.ndarray  # (1,) 1 if the gyros are taken for those of an uncalibrated chip
     travel: np.ndarray  # (8,) innovation, degrees of freedom, code
-    magnetometer: np.ndarray  # (2,) degrees of freedom, code; none and `MISSING` without one
+    magnetometer: np.ndarray  # (2,) degrees of freedom, code; 0, `MISSING` if there is none
 
 
 _SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 1, 8])
 
 
 def _kept(step: Step) -> jax.Array:
-    """A `_Step` as one vector, which leaves compiled code at once."""
+    """A `_Step` as one vector, so that compiled code returns a single array."""
     mean, sigma, seen = kept(step)
     parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
     parts += [sigma, step.prediction.code[None]]
@@ -101,7 +102,7 @@ def _kept(step: Step) -> jax.Array:
 
 
 class LiveMarg(Live):
-    """The attitude at each sample, at once (see the module for what differs from a replay).
+    """Live attitude at each sample (the module lists differences from a replay).
 
     Attributes:
         counts: `imu_nan`, `imu_inf`, `imu_absurd`, `imu_duplicate`, `imu_backward`, `imu_ahead`
@@ -123,14 +124,14 @@ class LiveMarg(Live):
         declination_rad: float = 0.0,
         machine: str | None = None,
     ):
-        """Start; programs are made before the first sample.
+        """Create the object, and build its programs before the first sample.
 
         Args:
-            parameters: as of a replay.
-            rate_hz: of the samples, by the data sheet; lost ones are detected by it.
+            parameters: as for a replay.
+            rate_hz: nominal sampling rate, by which lost samples are detected.
             declination_rad: of the Earth's field here, clockwise from true north.
-            machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
-                Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.
+            machine: machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
+                Programs of "vm" are kept in the user's cache; "c" needs minutes to compile once.
 
         Raises:
             ValueError: the rate is not positive, or there is no such machine.
@@ -148,23 +149,23 @@ class LiveMarg(Live):
         self._compile()
 
     def _restart(self) -> None:
-        """Forget all but the counts and the stamps."""
-        self._field = np.full(3, np.nan)  # of a sample that was refused
+        """Reset all but the counts and the stamps."""
+        self._field = np.full(3, np.nan)  # reading not yet used, as its sample was refused
         self._far: list[float] = []  # sizes of implausible readings in a row
-        self._pending: list[Any] = []  # leaves of steps that wait, and whether the unit lies still
-        self._looks = np.zeros((0, 8))  # what the monitor is shown
+        self._pending: list[Any] = []  # (leaves, still) of each waiting step
+        self._looks = np.zeros((0, 8))  # rows of the monitor's window
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
         self._q = (math.nan,) * 4
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
-        self._marks = 0  # flags that hold from a block to the next
-        self._starting = True  # until the filter has come to the newest sample
-        self._open = 0  # samples without a block, up to the last with a gyro at its end
+        self._marks = 0  # flags of the last block, valid until the next
+        self._starting = True  # until the filter has caught up with the newest sample
+        self._open = 0  # samples not in a block, up to the last with a gyro at the end of its range
         self._online = None
         self._path = SamplePath(self.parameters, self._usual_s)
         self._path.counts = self.counts
 
     def _compile(self) -> None:
-        """Compile all programs by blocks that are thrown away."""
+        """Compile all programs by running a few blocks, which are discarded."""
         count = 2 + math.ceil(self.parameters.start.still / self._usual_s) + 2 * self._path.n
         gravity = self.parameters.accelerometer.gravity
         rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -gravity, 2e-5, 2e-5, 2e-5], (count, 1))
@@ -181,17 +182,17 @@ class LiveMarg(Live):
     # ------------------------------------------------------------------------------ a sample
 
     def push(self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None) -> Attitude:
-        """Take a sample; the attitude at its stamp.
+        """Process a sample; return the attitude at its stamp.
 
         Args:
-            time_ns: stamp, whole nanoseconds of any clock.
-            gyro_rad_s: (3,) rate in body axes, forward-right-down; NaN is missing.
-            accel_m_s2: (3,) specific force.
-            field_t: (3,) T of the magnetometer, or None where it has not read since the last one.
+            time_ns: stamp, integer nanoseconds of any clock.
+            gyro_rad_s: (3,) rate in body axes, forward-right-down; NaN if missing.
+            accel_m_s2: (3,) specific force, in the same axes.
+            field_t: (3,) T, magnetometer in the same axes; None if not read since the last sample.
 
         Raises:
-            LiveError: a stamp or vector of another kind, or numbers that are those of another unit;
-                the object goes on with the next sample.
+            LiveError: a malformed stamp or vector, or values of another unit; the object continues
+                with the next sample.
         """
         time = stamp(time_ns)
         gyro, accel = numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)
@@ -217,7 +218,7 @@ class LiveMarg(Live):
         return self._answer(time, mark)
 
     def _read_field(self, field_t: Any) -> None:
-        """Calibrate a reading and keep it, if it can be the field of the Earth."""
+        """Calibrate a reading, and keep it if its magnitude is plausible for the Earth's field."""
         if field_t is None or self.parameters.use_magnetometer == "never":
             return
         raw = numbers("field", field_t, 3)
@@ -236,7 +237,7 @@ class LiveMarg(Live):
             refuse_field_unit(strength)
 
     def _saturated(self, gyro: np.ndarray, accel: np.ndarray, before: int) -> Flag:
-        """Flag of a sample at the end of a range; so many samples waited for a block before it."""
+        """Flag of a sample at the end of a range; `before` samples were waiting for a block."""
         full = bool(np.any(self._path.full(gyro[None])))
         if full:
             self._open = before + 1
@@ -244,7 +245,7 @@ class LiveMarg(Live):
         return Flag.SATURATED if full or hard else Flag(0)
 
     def _carry(self) -> None:
-        """Carry the last attitude over the newest sample by the gyros."""
+        """Propagate the last attitude to the newest sample by the gyros."""
         rows = self._path.rows[-3:]
         made = self._path.increments(self._path.time_ns[-3:], rows[:, :3], rows[:, 3:6])
         since = float(made.dt[-1]), np.asarray(made.theta[-1])
@@ -270,7 +271,7 @@ class LiveMarg(Live):
         return Attitude(time_ns, q / np.linalg.norm(q), self._sigma, flags)
 
     def _wait(self, made: list[MargSteps]) -> None:
-        """Add steps to those that wait."""
+        """Queue steps."""
         for steps in made:
             rows = steps.u, steps.y, steps.aux
             self._like = jax.tree_util.tree_structure(rows)
@@ -279,7 +280,7 @@ class LiveMarg(Live):
                 self._pending.append(([a[k] for a in leaves], bool(still)))
 
     def _catch_up(self) -> None:
-        """Take steps that wait, once the start is known."""
+        """Process queued steps, once the start is known."""
         if self._online is None:
             self._seek()
         for _ in range(_STEPS):
@@ -290,7 +291,7 @@ class LiveMarg(Live):
     # ------------------------------------------------------------------------ start and steps
 
     def _seek(self) -> None:
-        """Begin the filter as soon as the start is known."""
+        """Start the filter as soon as the initial belief is known."""
         if not self._pending:
             return
         increments, _ = self._path.until_start
@@ -306,7 +307,7 @@ class LiveMarg(Live):
         self._online = self._on(found[1])
 
     def _step(self) -> None:
-        """Take the next block into the filter, and carry its attitude to the newest sample."""
+        """Step the filter by the next block, and propagate its attitude to the newest sample."""
         assert self._online is not None
         p = self.parameters
         leaves, still = self._pending.pop(0)
@@ -323,7 +324,7 @@ class LiveMarg(Live):
         self._marks = int(self._doubts(found) | (Flag.REST if still else Flag(0)))
 
     def _doubts(self, found: _Step) -> Flag:
-        """Flags of the monitor on the last looks."""
+        """Flags of the monitor over its window of the last blocks."""
         most = math.ceil(_MONITORED_S / (self._path.n * self._usual_s))
         gain = [np.max(np.abs(found.gyro_gain))]
         square = [monitor.squared(found.travel[:6], self.parameters)]

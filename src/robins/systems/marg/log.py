@@ -1,4 +1,4 @@
-"""A log made ready for the filter: samples that are numbers, and its field, calibrated."""
+"""Preparation of a log for the filter: finite samples, and the calibrated field."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from robins.systems.study import Case
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedMargLog(LogPiece):
-    """A log as the filter takes it; K blocks of n samples, N samples. The world is a `Case`."""
+    """A log prepared for the filter; K blocks of n samples, N samples. The world is a `Case`."""
 
-    time_ns: np.ndarray  # (N,) int64, of each sample, from the first one on
+    time_ns: np.ndarray  # (N,) int64, of each sample
     samples: model.Samples
-    rows: np.ndarray  # (K,) the sample that each block ends with
+    rows: np.ndarray  # (K,) index of the last sample of each block
     look: FilterStart
     still: np.ndarray  # (K,) bool
     counts: dict[str, int]
@@ -33,7 +33,7 @@ class PreparedMargLog(LogPiece):
 def earth_field(
     field_t: np.ndarray, magnetometer: MargMagnetometer
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Readings (M, 3) [T] calibrated, which of them miss a number, and which are implausible."""
+    """Calibrated readings (M, 3) [T], and masks (M,) of incomplete and of implausible ones."""
     missing = ~np.all(np.isfinite(field_t), axis=1)
     field = turned(np.array(magnetometer.matrix), field_t - np.array(magnetometer.offset))
     size = np.linalg.norm(np.where(missing[:, None], 0.0, field), axis=1)
@@ -42,9 +42,10 @@ def earth_field(
 
 
 def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """(N, 3) the last of readings (M, 3) within each interval (time[k-1], time[k]]; NaN where none.
+    """Last reading (N, 3) within each interval (time[k-1], time[k]]; NaN where there is none.
 
-    Times are (N + 1,), the first one the beginning, and (M,) of the readings, ascending.
+    `time_ns` is (N + 1,), ascending, starting with the begin of the first interval; `field_ns` (M,)
+    are the times of the readings (M, 3), ascending.
     """
     out = np.full((len(time_ns) - 1, 3), np.nan)
     interval = np.searchsorted(time_ns, field_ns, side="left") - 1
@@ -54,7 +55,7 @@ def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> 
 
 
 def prepare(dataset: Dataset, parameters: MargReplay) -> PreparedMargLog:
-    """Take a log through the path of its samples, as one chunk.
+    """Prepare a log by `SamplePath`, as one chunk.
 
     Raises:
         ValueError: the log cannot be used; the message gives the reason.

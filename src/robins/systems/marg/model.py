@@ -1,26 +1,26 @@
 """Orientation from gyro, accelerometer and magnetometer: the motion and the sensors.
 
-With q body to NED, C = C(q), f the specific force, w the rate that is read::
+With q body to NED, C = C(q), f the specific force, w the measured rate::
 
     q' = q (w + M w - b) / 2,   v' = C (f - b_a) + g,   p' = v
     b' = white,   M' = 0,   b_a' = white,   field' = white
     declination' = -declination / T + white while moving,   0 at rest
     azimuths' = 0,   gravity g' = 0
 
-A step is a block of samples, integrated beforehand (`Block`); F = exp of the linear form of these
-stands in `advance_linear`, Q in `_factor`. What is peculiar to it:
+A step is a block of samples, integrated beforehand (`Block`); the transition matrix is in
+`advance_linear`, the process noise in `_factor`. Peculiarities:
 
-- the accelerometer is integrated, not used as a measurement: it carries the velocity, and gravity
-  shows in that a velocity and a place which do not run away leave no room for a tilt error. A swing
-  of the hand then pulls the attitude no more than its mean does;
-- scale factors and misalignments of the gyros are nine states. They are what a good MEMS gyro
-  drifts by when it is turned about, and tilt, which the accelerometer sees well, shows them;
-- the magnetometer gives a heading and no tilt. North is where the field pointed at the start. How
-  the field of other places is turned against that is a state, `declination`, which does not change
-  while the unit lies still: reading the same place again adds no information.
+- the accelerometer is integrated, not used as a measurement: a tilt error would make velocity and
+  position drift, which the bounded travel contradicts. A swing of the hand then disturbs the
+  attitude only by its mean;
+- scale factors and misalignments of the gyros are nine states. They cause most of the drift of a
+  good MEMS gyro in motion, and are observable through tilt;
+- the magnetometer gives heading and no tilt. North is the direction of the horizontal field at the
+  start. The azimuth of the field of other places is a state, `declination`, which is constant at
+  rest: reading the same place again adds no information.
 
-Samples become blocks by `integrate`; `causal_attitudes` and `smoothed_attitudes` go back, from
-states at the ends of blocks to an attitude at every sample.
+Samples become blocks by `integrate`; `causal_attitudes` and `smoothed_attitudes` turn states at the
+ends of blocks into an attitude at every sample.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from robins.systems.study import SensorAxes, StateBlock
 
 XYZ = ("x", "y", "z")
 TRAVEL, REST, MAGNETOMETER, REVISIT = "travel", "rest", "magnetometer", "revisit"
-SITES = 4  # where the unit has lain still; the azimuth of the field of each is a state
+SITES = 4  # places of rest; the azimuth of the field at each is a state
 _TRAVELLED = [
     f"{what} {axis} [{u}]" for what, u in (("velocity", "m/s"), ("place", "m")) for axis in NED
 ]
@@ -58,18 +58,18 @@ SENSORS = {
 
 
 class MargState(NamedTuple):
-    """The state; 32 tangent components in this order."""
+    """State; 32 tangent components in this order."""
 
     q_nb: Rotation  # body to north-east-down, north that of the field at the start
     v_n: Array  # (3,) m/s
-    p_n: Array  # (3,) m, from the middle of where the unit moves about
+    p_n: Array  # (3,) m, from the centre of the unit's motion
     gyro_bias: Array  # (3,) rad/s
-    gyro_gain: Array  # (3, 3) true rate = (I + gain) read rate - bias
+    gyro_gain: Array  # (3, 3) true rate = (I + gain) measured rate - bias
     accel_bias: Array  # (3,) m/s^2
-    declination: Array  # () rad, of the field here and now, clockwise from north
-    field: Array  # (2,) T, strength along the horizontal and down
+    declination: Array  # () rad, of the present field, clockwise from north
+    field: Array  # (2,) T, horizontal strength and down
     azimuths: Array  # (SITES,) rad, of the field at each site, clockwise from north
-    gravity: Array  # () m/s^2, as the accelerometers read it
+    gravity: Array  # () m/s^2, as read by the accelerometers
 
 
 HEADING, GAINS, DECLINATION, FIELD = 2, slice(12, 21), 24, slice(25, 27)
@@ -95,9 +95,9 @@ class Integrals(NamedTuple):
     dt_s: ArrayLike  # ()
     turn: ArrayLike  # (4,) quaternion, body axes at the end to those at the start
     dv: ArrayLike  # (3,) m/s, integral of specific force
-    turn_time: ArrayLike  # (3, 3) s, integral of the rotation R(t)
+    turn_time: ArrayLike  # (3, 3) s, integral of R(t), body axes at t to those at the start
     turn_rates: ArrayLike  # (3, 9) rad, integral of R_ij(t) times the k-th rate, at 3 j + k
-    angle: ArrayLike  # () rad, turned in all
+    angle: ArrayLike  # () rad, sum of the angles turned
 
 
 class Block(NamedTuple):
@@ -105,12 +105,12 @@ class Block(NamedTuple):
 
     samples: Integrals
     still: ArrayLike  # () 1 where the unit lies still, else 0
-    lost_turn: ArrayLike  # (3,) rad, spread of what was not sampled, body axes; or () of each
-    lost_dv: ArrayLike  # () m/s, the same of the velocity
+    lost_turn: ArrayLike  # (3,) or () rad, sigma of the rotation that was not sampled, body axes
+    lost_dv: ArrayLike  # () m/s, the same for velocity
 
 
 class MargNoise(NamedTuple):
-    """Process noise of a second, and how sure what is known of the motion and the field is."""
+    """Process noise, and sigmas of the measurements of travel, rest and field."""
 
     gyro: ArrayLike  # rad/sqrt(s)
     turn_error: ArrayLike  # rad per rad turned
@@ -118,7 +118,7 @@ class MargNoise(NamedTuple):
     gyro_bias_still: ArrayLike  # rad/s/sqrt(s)
     gyro_bias_moving: ArrayLike  # rad/s/sqrt(s)
     accel_bias: ArrayLike  # m/s^2/sqrt(s)
-    declination: ArrayLike  # rad, of the stationary Gauss-Markov process
+    declination: ArrayLike  # rad, sigma of the stationary Gauss-Markov process
     declination_time: ArrayLike  # s
     field_walk: ArrayLike  # T/sqrt(s)
     velocity: ArrayLike  # m/s, moving
@@ -128,19 +128,19 @@ class MargNoise(NamedTuple):
 
 
 def correction(x: MargState, block: Block) -> Array:
-    """(3,) rad, what bias and gain add to the turn of a block, in body axes at its start."""
+    """Rotation (3,) [rad] that bias and gain add to a block, in body axes at its start."""
     gain = jnp.asarray(block.samples.turn_rates) @ x.gyro_gain.reshape(9)
     return gain - jnp.asarray(block.samples.turn_time) @ x.gyro_bias
 
 
 def persistence(noise: MargNoise, block: Block) -> Array:
-    """Share of the declination that a block leaves: all of it while the unit lies still."""
+    """Decay factor of the declination over a block; 1 while the unit lies still."""
     moving_s = jnp.asarray(block.samples.dt_s) * (1.0 - jnp.asarray(block.still))
     return jnp.exp(-moving_s / noise.declination_time)
 
 
 def _velocity_gain(x: MargState, block: Block) -> Array:
-    """(3,) m/s, navigation axes, without gravity. The turn was at fault by half on the way."""
+    """Velocity gain (3,) [m/s], NED, without gravity; rotated by half the attitude correction."""
     dv = jnp.asarray(block.samples.dv)
     dv = dv + jnp.cross(0.5 * correction(x, block), dv)
     return x.q_nb.apply(dv - jnp.asarray(block.samples.turn_time) @ x.accel_bias)
@@ -162,7 +162,7 @@ def advance(noise: MargNoise, x: MargState, block: Block) -> MargState:
 
 
 def _factor(noise: MargNoise, x: MargState, block: Block) -> Array:
-    """(32, 32) of the process noise: diagonal, but that a turn is lost about body axes."""
+    """Process noise factor (32, 32): diagonal but for attitude, whose noise is in body axes."""
     dt, moving = jnp.asarray(block.samples.dt_s), 1.0 - jnp.asarray(block.still)
     root = jnp.sqrt(dt)
     kept = persistence(noise, block)
@@ -171,7 +171,7 @@ def _factor(noise: MargNoise, x: MargState, block: Block) -> Array:
     turn = jnp.broadcast_to(turn, (3,))
     push = jnp.sqrt((noise.accel * root) ** 2 + jnp.asarray(block.lost_dv) ** 2)
     walk = jnp.where(moving > 0.0, noise.gyro_bias_moving, noise.gyro_bias_still) * root
-    # sqrt(1 - kept^2), with a finite derivative where nothing is lost
+    # sqrt(1 - kept^2), with a finite derivative at kept = 1
     lost = -jnp.expm1(2.0 * jnp.log(kept))
     drift = jnp.where(lost > 0.0, jnp.sqrt(jnp.where(lost > 0.0, lost, 1.0)), 0.0)
     parts = [
@@ -225,7 +225,7 @@ def _travel_sigma(noise: MargNoise) -> Array:
 
 
 def _read_rest(x: MargState, seen_b: Array):
-    """Velocity, and what the unit, lying still, would seem to turn by."""
+    """Velocity and corrected rate, both zero at rest."""
     rate_b = seen_b[:3]
     return jnp.concatenate([x.v_n, rate_b + x.gyro_gain @ rate_b - x.gyro_bias])
 
@@ -243,7 +243,7 @@ def _rest_sigma(noise: MargNoise, x: MargState, seen_b: Array):
 
 
 def _level(x: MargState, field_b: Array):
-    """Strength along the horizontal, safe at zero, and the field in navigation axes."""
+    """Horizontal strength, differentiable at zero, and the field in navigation axes."""
     m = x.q_nb.apply(field_b)
     square = m[0] ** 2 + m[1] ** 2
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0), m
@@ -263,13 +263,13 @@ def _magnetometer_linear(x: MargState, field_b: Array):
 
 def _magnetometer_sigma(noise: MargNoise, x: MargState, field_b: Array):
     strength, _ = _level(x, field_b)
-    # A field that points down has no azimuth: half a turn is as little as can be known.
+    # A vertical field has no azimuth: its sigma saturates at half a turn.
     azimuth = jnp.pi * jnp.tanh(noise.field / jnp.maximum(strength, 1e-3 * noise.field) / jnp.pi)
     return jnp.stack([azimuth, jnp.asarray(noise.field), jnp.asarray(noise.field)])
 
 
 def _read_site(x: MargState, seen_b: Array):
-    """Azimuth of the field that is read against that of a site; `seen_b` as of "revisit"."""
+    """Azimuth of the measured field relative to that of a site; `seen_b` is aux of "revisit"."""
     _, m = _level(x, seen_b[:3])
     return Angle(jnp.arctan2(m[1], m[0]) - seen_b[4:] @ x.azimuths)
 
@@ -284,18 +284,18 @@ def _site_sigma(x: MargState, seen_b: Array):
 
 
 def model_of(parameters: MargReplay) -> Model:
-    """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
+    """Model propagated by gyro and accelerometer, updated by travel, rest and magnetometer.
 
     The Jacobian of the magnetometer has no columns of tilt: a disturbed field cannot tilt the
-    attitude, at the price of its little information on tilt.
+    attitude, at the cost of the little information on tilt that it has.
 
     Returns:
         A model with sensors, in order: "travel" ((6,) zeros while the unit moves, else NaN), "rest"
-        ((6,) zeros at rest, else NaN; aux (4,) mean rate read and its spread) and, where the field
-        is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]) and
-        "revisit" (`Angle(0)` where a site is read; aux (4 + SITES,) field [T], sigma of its azimuth
-        [rad] and 1 for the site). The measurement is zero and the reading the prediction of aux by
-        the state: the innovation is minus the reading.
+        ((6,) zeros at rest, else NaN; aux (4,) mean measured rate and its sigma) and, where the
+        field is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T])
+        and "revisit" (`Angle(0)` where a site is read; aux (4 + SITES,) field [T], sigma of its
+        azimuth [rad] and 1 for the site). Measurements are zero, and h(x) is the reading in
+        aux corrected by the state, so the innovation is -h(x).
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
     magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest
@@ -335,7 +335,7 @@ def model_of(parameters: MargReplay) -> Model:
 
 
 class Samples(NamedTuple):
-    """Increments in blocks of n; a block that is not full ends in increments of no length."""
+    """Increments in blocks of n; a short block is padded with increments of zero duration."""
 
     dt_s: Any  # (K, n)
     theta: Any  # (K, n, 3) rad, rotation vector of each interval
@@ -375,7 +375,7 @@ def integrate(samples: Samples) -> tuple[Integrals, np.ndarray]:
 
 
 def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
-    """(n, 4) attitude at each sample against the start of the block."""
+    """Attitude (n, 4) at each sample relative to the start of the block."""
 
     def add(q, row):
         dt, theta = row
@@ -389,10 +389,10 @@ def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
 def causal_attitudes(
     start: MargState, posterior: MargState, samples: Samples
 ) -> Float[np.ndarray, "K n 4"]:
-    """Attitude at every sample from what was known by then.
+    """Attitude at every sample, by the causal filter.
 
-    Inside a block the last posterior is carried on by the gyro; at its end stands the new one.
-    `start` is the state before the first block, `posterior` has those at the ends, leading axis K.
+    Inside a block the last posterior is propagated by the gyros; its end has the new posterior.
+    `start` is the state before the first block, `posterior` those at the ends, leading axis K.
     """
     before = jax.tree_util.tree_map(
         lambda a, b: np.concatenate([np.asarray(a)[None], np.asarray(b)[:-1]]), start, posterior
@@ -413,8 +413,8 @@ def smoothed_attitudes(
 ) -> tuple[Float[np.ndarray, "K n 4"], Float[np.ndarray, "4"]]:
     """Attitude at every sample from smoothed states at the ends of blocks, and at the start.
 
-    The gyro carries each state over the next block; what it misses the next one by is laid over
-    the block in equal parts. The first block is gone through backwards.
+    The gyros propagate each state over the next block; the misclosure with the next state is
+    distributed evenly over the samples. The first block is propagated backwards.
     """
     given = smoothed.gyro_bias, smoothed.gyro_gain, samples.dt_s, samples.theta
     q_end = np.asarray(smoothed.q_nb.wxyz)
@@ -424,13 +424,13 @@ def smoothed_attitudes(
 
 
 def _attitude_before(block: tuple[Array, Array, Array, Array, Array]) -> Array:
-    """(4,) attitude before a block, from that at its end."""
+    """Attitude (4,) at the start of a block, from that at its end."""
     q_end, *given = block
     return rotation.normalise(rotation.multiply(q_end, rotation.conjugate(_turns(*given)[-1])))
 
 
 def _joined_attitudes(block: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
-    """(n, 4) attitudes of a block between two that are known."""
+    """Attitudes (n, 4) in a block with known attitudes at start and end."""
     start, q_end, *given = block
     q = rotation.multiply(start[None], _turns(*given))
     missed = rotation.to_rotvec(rotation.multiply(q_end, rotation.conjugate(q[-1])))

@@ -1,8 +1,8 @@
-"""Self-contradictions of a replay: states and innovations that its own assumptions forbid.
+"""Self-contradictions of a replay: states and innovations inconsistent with its assumptions.
 
-A filter whose model is wrong goes on with a small sigma. Its states show it: a declination that the
-field of no room has, gains that no gyro is sold with, and a velocity or place that is again and
-again beyond the stated sigma, which means a wrong tilt.
+A filter whose model is wrong keeps a small sigma, but its states show it: a declination beyond that
+of any room, gyro gains beyond those of any product, and a velocity or position that repeatedly
+exceeds the stated sigma, which means a wrong tilt.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from robins.systems.suspects import edges
 from robins.systems.tables import SensorUpdates
 
 _SIGMAS = 3.0
-_LOOKS = 20  # of travel, in the mean of its squares
-_LEAST_LOOKS = 10  # of a log that has no more
-_SQUARE = 1.5  # of a component in its stated standard deviations, in that mean
+_LOOKS = 20  # measurements of travel in a mean square
+_LEAST_LOOKS = 10  # fewest of them, in a short log
+_SQUARE = 1.5  # limit of that mean square, per component, in stated variances
 _LASTING_S = 5.0
-_GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be put back for
+_GAP_SHARE = 0.002  # share of samples at the end of their range that could not be restored
 
 
 class Contradictions(NamedTuple):
-    """Doubts of B blocks."""
+    """Contradictions found in each of B blocks."""
 
     declination: np.ndarray  # (B,) bool
     gain: np.ndarray  # (B,) bool
@@ -36,7 +36,7 @@ class Contradictions(NamedTuple):
 
     @property
     def any(self) -> np.ndarray:
-        """(B,) bool: some doubt."""
+        """Mask (B,) of blocks with any contradiction."""
         return self.declination | self.gain | self.tilt | self.refused
 
 
@@ -49,18 +49,18 @@ def doubts_of(
 ) -> Contradictions:
     """Contradictions of states or innovations of a filter or a smoother with the parameters.
 
-    - declination: further from zero than three of its standard deviations;
-    - gain: one of nine beyond three standard deviations;
-    - tilt: velocity and place, squared and in the mean over the last 20 looks, beyond 1.5 times
-      the variances that were stated, whatever the filter has learned of them;
-    - refused: the magnetometer at ten looks in a row or more.
+    - declination: beyond three times its sigma in the parameters;
+    - gain: any of the nine beyond three times its sigma;
+    - tilt: mean square of velocity and position over 20 successive measurements of travel (10 at
+      least in a short log) above 1.5 times the stated variance, whatever the filter has learned;
+    - refused: ten or more successive magnetometer measurements.
 
     Args:
-        declination: (B,) of the states [rad], and
-        gain: (B, ...) of the gyros, each.
-        updates: by sensor, of the filter or of the run that was smoothed; of travel as `as_stated`.
-        parameters: what was assumed.
-        bare: (B,) bool, the gyros are taken for those of a bare chip.
+        declination: (B,) [rad].
+        gain: (B, ...) gyro gains of each block.
+        updates: by sensor, of the filter or of the run that was smoothed; travel as in `as_stated`.
+        parameters: assumptions of the filter.
+        bare: (B,) bool, the gyros are taken for those of an uncalibrated chip.
     """
     gyro = parameters.gyro
     usual = np.where(bare, np.hypot(gyro.gain, gyro.bare_gain), gyro.gain)
@@ -81,7 +81,7 @@ def doubts_of(
 
 
 def squared(innovation: np.ndarray, parameters: MargReplay) -> np.ndarray:
-    """Sum of squares of innovations of travel (..., 6) in their stated standard deviations."""
+    """Sum of squares of travel innovations (..., 6), normalised by the stated sigmas."""
     travel = parameters.travel
     ratio = innovation / np.repeat([travel.velocity, travel.place], 3)
     return np.asarray(np.sum(ratio**2, axis=-1))
@@ -90,7 +90,7 @@ def squared(innovation: np.ndarray, parameters: MargReplay) -> np.ndarray:
 def as_stated(
     updates: Mapping[str, SensorUpdates], parameters: MargReplay
 ) -> dict[str, SensorUpdates]:
-    """Updates with the squares of travel by its stated deviations in the place of its NIS."""
+    """Updates whose NIS of travel is replaced by `squared`."""
     travel = updates[TRAVEL]
     square = squared(np.asarray(travel.innovation), parameters)
     return {**updates, TRAVEL: travel._replace(nis=square)}
@@ -121,13 +121,13 @@ def _in_a_row(update: SensorUpdates, least: int) -> np.ndarray:
 
 
 def sentences(name: str, doubt: Contradictions, mean: MargState, dt_s: np.ndarray) -> list[str]:
-    """Warnings of a filter: what was doubtful for more than 5 s, and what follows.
+    """Warnings on contradictions of a filter that last more than 5 s, with their consequences.
 
     Args:
         name: of the filter.
-        doubt: of its states.
-        mean: leading axis B.
-        dt_s: (B,) lengths of the blocks.
+        doubt: its contradictions.
+        mean: its states, leading axis B.
+        dt_s: (B,) durations of the blocks [s].
     """
     out = []
     most = float(np.degrees(np.max(np.abs(np.asarray(mean.declination)), initial=0.0)))
@@ -163,7 +163,7 @@ def sentences(name: str, doubt: Contradictions, mean: MargState, dt_s: np.ndarra
 
 
 def of_samples(counts: Mapping[str, int], samples: int) -> list[str]:
-    """Warnings where sensors were at the end of their range, or gyros hung, too often."""
+    """Warnings if too many samples are at the end of their range, or from gyros that hang."""
     lost, off = counts["imu_saturated"] - counts["imu_bridged"], []
     if lost > _GAP_SHARE * samples:
         off.append(f"{lost} samples are at the end of their range and could not be put back")

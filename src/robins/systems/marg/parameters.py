@@ -1,7 +1,7 @@
 """Parameters of a replay of gyro, accelerometer and magnetometer, with units.
 
-The defaults are those of a cheap MEMS unit that is held in a hand or strapped to a limb or a small
-machine. Nothing in them is of one unit or one log.
+The defaults are those of a low-cost MEMS unit held in a hand or strapped to a limb or a small
+machine. None is taken from a particular unit or log.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class MargGyro(Parameters):
-    """The gyros: true rate = (I + gain) (what is read) - bias."""
+    """The gyros: true rate = (I + gain) (measured rate) - bias."""
 
     noise: q.AngleWalk = default("0.01 deg/s/sqrt(Hz)")
     bias: q.RateSize = default("3 deg/s")
     bias_walk: q.RateWalkSize = default("0.0006 deg/s/sqrt(s)")
-    # vibration and warmth of the hand move a bias faster than rest does
+    # vibration and the warmth of a hand make the bias drift faster than at rest
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
-    # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
+    # sigma of each of nine scale factors, misalignments and cross-couplings
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3000 ppm")
-    # the same of an uncalibrated chip, taken once the motion is likelier with it
+    # the same for an uncalibrated chip, used once it explains the motion better
     bare_gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3 %")
-    # what nine numbers do not explain, as a share of the angle turned
+    # residual error not explained by the nine gains, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
     range: q.AngleRate = default("2000 deg/s")
 
@@ -53,11 +53,11 @@ class Accelerometer(Parameters):
 
 
 class MargMagnetometer(Parameters):
-    """The magnetometer and the field about it.
+    """The magnetometer and the ambient field.
 
-    A reading is first calibrated: matrix (reading - offset). The field of a room bends from place
-    to place; `noise` is how far a reading is from the field that the filter carries along, and
-    `declination` how far the mean of such bends over many places can be from zero.
+    A reading is first calibrated: matrix (reading - offset). The field of a room varies from place
+    to place; `noise` is the sigma of a reading about the field state of the filter, and
+    `declination` that of the local azimuth of the field, averaged over places.
     """
 
     offset: Field = default("0 uT")
@@ -65,23 +65,23 @@ class MargMagnetometer(Parameters):
     noise: q.FieldStrength = default("2.5 uT")
     declination: q.Spread = default("2.5 deg")
     declination_time: q.Duration = default("60 s")
-    # azimuth of the field where the unit lies again, without the part of a wrong tilt
+    # sigma of the azimuth of the field at a revisited site, without the effect of tilt errors
     site: q.Spread = default("0.3 deg")
-    # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
+    # random walk of strength and dip of the undisturbed field: sigma after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
-    # magnitudes outside are no field of the Earth: not used, counted
+    # readings outside these magnitudes are counted and not used
     least: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("8 uT")
     most: q.FieldStrength = default("200 uT")
     gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.95
-    # so many seconds of motion in one and the same other field make that field the reference
+    # time in motion within one other field after which that field becomes the reference
     patience: q.Duration = default("20 s")
 
 
 class BoundedTravel(Parameters):
-    """Prior knowledge of the motion: it does not run away.
+    """Bounds of the motion, as a pseudo-measurement.
 
-    Seen once in `every` of motion, velocity and place are zero with these spreads. For a vehicle
-    give its speed, and a large place.
+    Once in `every` of motion, velocity and position are measured as zero with these sigmas. For a
+    vehicle give its speed, and a large `place`.
     """
 
     velocity: q.Speed = default("1 m/s")
@@ -90,18 +90,18 @@ class BoundedTravel(Parameters):
 
 
 class Rest(Parameters):
-    """Detection of rest, and the measurements that it gives."""
+    """Detection of rest, and the sigmas of its measurements of rate and velocity."""
 
     detect: bool = True
     after: q.Duration = default("1.5 s")
     quiet_rate: q.AngleRate = default("2 deg/s")
     quiet_accel: q.Acceleration = default("0.5 m/s^2")
-    # a mean rate further than this from the bias that rest has shown last is no bias but a turn,
+    # largest difference of the mean rate from the last bias found at rest; beyond, it is a turn,
     most_rate: q.AngleRate = default("4 deg/s")
-    # unless the log begins with it or it lasts, and then up to
+    # or a new bias of up to `most_bias`, if it lasts this long or the log begins with it
     new_bias: q.Duration = default("5 s")
     most_bias: q.AngleRate = default("10 deg/s")
-    # share of the field, which turns with the Earth where the unit turns
+    # largest change of the field at rest, as a share of it; it changes when the unit turns
     quiet_field: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.05
     rate: q.AngleRate = default("0.03 deg/s")
     velocity: q.Speed = default("0.01 m/s")
@@ -116,17 +116,16 @@ class MargStart(Parameters):
     heading: q.Spread = default("1 deg")
     tilt_moving: q.Spread = default("5 deg")
     heading_moving: q.Spread = default("30 deg")
-    # north is the field where the log begins, or its mean over the places where the unit will be:
-    # then the heading of the start is no better than the declination there
+    # definition of north: the field where the log begins, or its mean over all places of the log;
+    # with the mean, the initial heading is no better than the declination there
     north: Literal["start", "mean"] = "start"
 
 
 class StatedErrors(Parameters):
-    """Errors that no state carries and the stated standard deviations of attitude must hold.
+    """Errors without a state, which the stated standard deviations of attitude must include.
 
-    Axes of a housing, gyros that do not respond at once, and stamps that are late cannot be
-    separated from attitude. They do not average out, so they are added to the stated sigma, not to
-    a noise.
+    Misalignment of the housing, delayed response of the gyros, and late stamps cannot be separated
+    from attitude. They do not average out, so they are added to the stated sigma, not to a noise.
     """
 
     tilt: q.Spread = default("0.3 deg")
@@ -137,10 +136,10 @@ class StatedErrors(Parameters):
 class MargUpdate(Parameters):
     """Steps of the filter."""
 
-    # a sample is the mean over the interval it ends, or the value at an instant
+    # a sample is the mean over the interval that it ends, or the value at its instant
     samples: Literal["means", "instants"] = "means"
     block: q.Duration = default("0.1 s")
-    # an interval between samples longer than this many usual ones is a gap
+    # an interval longer than this many usual ones is a gap
     gap: Annotated[float, pydantic.Field(gt=1.0, le=1e6)] = 3.0
     gap_rate: q.AngleRate = default("60 deg/s")
     gap_accel: q.Acceleration = default("3 m/s^2")
@@ -152,7 +151,7 @@ class MargReplay(Parameters):
     system: Literal["marg"] = "marg"
     title: str = "Orientation from gyro, accelerometer and magnetometer"
     use_magnetometer: Literal["always", "undisturbed", "never"] = "undisturbed"
-    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of mount
+    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of the mounting
     gyro: MargGyro = pydantic.Field(default_factory=MargGyro)
     accelerometer: Accelerometer = pydantic.Field(default_factory=Accelerometer)
     magnetometer: MargMagnetometer = pydantic.Field(default_factory=MargMagnetometer)

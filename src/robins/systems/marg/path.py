@@ -1,17 +1,17 @@
-"""Path from samples to steps of the filter, chunk by chunk, of a replay and of a live object.
+"""Conversion of samples to filter steps, chunk by chunk, for replays and live objects.
 
-Samples are integrated over blocks; what is known at the end of each block becomes its measurements.
-Any chunks of the same samples give the same bits: a replay is one chunk, a live object is chunks of
-one sample. Later samples are used as far as the latency of each stage reaches:
+Samples are integrated over blocks, and each block gets the measurements at its end. The result does
+not depend, to the bit, on the division into chunks: a replay is one chunk, a live object has chunks
+of one sample. Each stage uses later samples, within its latency:
 
-- a peak of a gyro that the end of its range cut off is put back from both flanks: up to `LONGEST_S`
-  and `FLANK` samples;
-- where the ends of the ranges are given (`saturation.levels` of a whole log), peaks before the
-  first that shows them are put back too; else they are those that the samples so far show;
-- the turn over a gap that can be of more than `_LOST_RAD` is found from gravity and field on both
-  sides of it, over `start.moving`;
+- a gyro peak clipped at the end of its range is restored from both flanks: up to `LONGEST_S` and
+  `FLANK` samples;
+- if the ends of the ranges are given (`saturation.levels` of a whole log), all peaks are restored;
+  otherwise the ends are found from the samples so far, so earlier peaks stay clipped;
+- the rotation over a gap that may exceed `_LOST_RAD` is found from gravity and field on both sides
+  of it, over `start.moving`;
 - samples that are values at an instant need the next one, and so does a stamp after a long
-  interval, which may be late and not after a gap;
+  interval, which may be late rather than follow a gap;
 - the start needs `start.still` of rest or `start.moving` of motion, and `rest.after` of rest.
 """
 
@@ -38,8 +38,8 @@ from robins.systems.marg.saturation import FLANK, LONGEST_S, GyroRange, beyond, 
 from robins.systems.marg.sites import Look, Sites
 from robins.systems.marg.start import FilterStart, first_belief, initial_alignment, turn_across
 
-_FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
-_LOST_RAD = math.radians(30.0)  # turn of a gap, beyond which rates at its ends do not bridge it
+_FALLING = 0.3  # of gravity: less specific force is free fall, where tilt is not observable
+_LOST_RAD = math.radians(30.0)  # rotation in a gap that the rates at its ends cannot bridge
 
 
 class MargSteps(NamedTuple):
@@ -49,14 +49,14 @@ class MargSteps(NamedTuple):
     y: dict[str, Any]
     aux: dict[str, Any]
     still: np.ndarray  # (K,) bool
-    samples: model.Samples  # a block that is not full ends in increments of no length
+    samples: model.Samples  # a short block is padded with increments of zero duration
 
 
 class SamplePath:
-    """Samples to steps of the filter (see the module).
+    """Converter of samples to steps of the filter (see the module).
 
     Attributes:
-        n: samples of a block.
+        n: number of samples in a block.
         counts: `imu_saturated`, `imu_bridged`, `imu_frozen`, `imu_gaps`,
             `blocks_in_free_fall`.
         range: ends of the ranges of the gyros.
@@ -69,44 +69,44 @@ class SamplePath:
         kind: Literal["rate", "increment"] = "rate",
         levels: np.ndarray | None = None,
     ):
-        """Begin.
+        """Create a converter without samples.
 
         Args:
-            parameters: as of a replay.
-            usual_s: s, sampling interval; lost samples are known by it.
-            kind: of the samples, as of `ImuTable`.
-            levels: (3, 2) rad/s, ends of the ranges; None: as the samples so far show.
+            parameters: as for a replay.
+            usual_s: s, sampling interval, by which lost samples are detected.
+            kind: of the samples, as in `ImuTable`.
+            levels: (3, 2) rad/s, ends of the ranges; None: found from the samples so far.
         """
         self._parameters, self._usual_s = parameters, usual_s
         self._kind: Literal["rate", "increment"] = kind
         self.n = max(1, round(parameters.update.block / usual_s))
-        # a peak that ends in a block may have started in those before
+        # a peak that ends in a block may have started in earlier ones
         self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
-        self._side = math.ceil(parameters.start.moving / usual_s)  # samples beside a gap
+        self._side = math.ceil(parameters.start.moving / usual_s)  # samples on each side of a gap
         self._by_sample = levels is None and kind == "rate"
         self.range = GyroRange(levels)
         self._watch, self._pace = RestDetector(self.n * usual_s, parameters.rest), MeasurementPace()
         self._sites = Sites(model.SITES)
         self.counts: Counter[str] = Counter()
-        self.time_ns = np.zeros(0, np.int64)  # of the samples kept, and
-        self.rows = np.zeros((0, 9))  # their gyro, accel and field
-        self._context = 0  # of them, those that are in blocks
-        # increments and field up to the start; None once that is found
+        self.time_ns = np.zeros(0, np.int64)  # (M,) of the samples kept
+        self.rows = np.zeros((0, 9))  # (M, 9) their gyro, accel and field
+        self._context = 0  # number of them already in blocks
+        # increments and field until the start is found, then None
         self._begun: list[tuple[np.ndarray, ...]] | None = []
-        self._in_motion = False  # the start is one in motion
+        self._in_motion = False  # the log starts in motion
 
     @property
     def waiting(self) -> int:
-        """Number of samples that are in no block yet."""
+        """Number of samples not yet in a block."""
         return len(self.rows) - self._context
 
     def push(self, time_ns: np.ndarray, rows: np.ndarray) -> list[MargSteps]:
-        """Take samples; the steps that they complete.
+        """Add samples; return the steps that they complete.
 
         Args:
-            time_ns: (M,) int64, rising.
+            time_ns: (M,) int64, increasing.
             rows: (M, 9) gyro [rad/s], accel [m/s^2], or their increments, and field [T] in body
-                axes; the field is NaN where it was not read since the sample before.
+                axes; the field is NaN if it was not read since the previous sample.
         """
         made = []
         for at in range(0, len(rows), 1 if self._by_sample else max(len(rows), 1)):
@@ -121,14 +121,14 @@ class SamplePath:
         return made
 
     def finish(self) -> list[MargSteps]:
-        """Steps of the samples that are left, of which the last block need not be full."""
+        """Steps of the remaining samples; the last block may be short."""
         return [self._cut(len(self.rows))] if self.waiting > 0 else []
 
     def start(self, is_whole: bool = False) -> tuple[FilterStart, Belief] | None:
-        """The start and the belief there, once later samples do not change them; None before.
+        """Start and initial belief, once later samples cannot change them; None before.
 
         Args:
-            is_whole: no samples follow.
+            is_whole: True if no samples follow.
         """
         p = self._parameters
         if not self._begun:
@@ -162,26 +162,26 @@ class SamplePath:
     # ------------------------------------------------------------------------ samples to blocks
 
     def _whole_blocks(self) -> int:
-        """Number of blocks whose samples are all there, flanks of their peaks included."""
+        """Number of blocks whose samples are complete, including the flanks of their peaks."""
         count, full = 0, self.full(self.rows[:, :3])
         while self._is_whole(self._context + count * self.n, full):
             count += 1
         return count
 
     def full(self, rate: np.ndarray) -> np.ndarray:
-        """(M, 3) bool: rates (M, 3) [rad/s] at the end of the range."""
+        """Mask (M, 3) of rates (M, 3) [rad/s] at the end of the range."""
         if self._kind != "rate":  # increments have no range
             return np.zeros(rate.shape, bool)
         return beyond(rate, self.range.levels, self._parameters.gyro.range)
 
     def hard(self, accel: np.ndarray) -> np.ndarray:
-        """(M,) bool: specific forces (M, 3) [m/s^2] at the end of the range."""
+        """Mask (M,) of specific forces (M, 3) [m/s^2] at the end of the range."""
         if self._kind != "rate":
             return np.zeros(len(accel), bool)
         return np.any(np.abs(accel) >= 0.99 * self._parameters.accelerometer.range, axis=1)
 
     def _is_whole(self, begin: int, full: np.ndarray) -> bool:
-        """True if all that a block depends on is there; it begins after the sample `begin - 1`."""
+        """True if all samples needed by a block are there; it begins after sample `begin - 1`."""
         end, time_ns = begin + self.n, self.time_ns
         needed = end + (self._parameters.update.samples == "instants")
         more = len(time_ns) - end
@@ -195,7 +195,7 @@ class SamplePath:
                 return False
         for axis in np.flatnonzero(np.any(full[begin:needed], axis=0)):
             last = begin + int(np.flatnonzero(full[begin:needed, axis])[-1])
-            # a longer peak is not put back, so no more of it has to be looked at
+            # longer peaks are not restored, so no more samples are needed
             low, high = max(0, last - self._most_context), last + self._most_context + FLANK
             column = full[:high, axis]
             below = low + np.flatnonzero(~column[low:last])
@@ -209,7 +209,7 @@ class SamplePath:
         return True
 
     def _cut(self, end: int) -> MargSteps:
-        """Steps of the samples up to a number; what is context of the next block is kept."""
+        """Steps of the samples before index `end`; keep those that later blocks need as context."""
         p, n, context = self._parameters, self.n, self._context
         accel, field = self.rows[:, 3:6], self.rows[:, 6:]
         full, hard = self.full(self.rows[:, :3]), self.hard(accel)
@@ -239,7 +239,7 @@ class SamplePath:
         return self._steps(samples, *lost)
 
     def _lost(self, begin: int, end: int) -> np.ndarray:
-        """Last samples before gaps too long to bridge, between `begin - 1` and `end - 1`."""
+        """Last samples (indices) before gaps too long to bridge, from `begin - 1` to `end - 1`."""
         p = self._parameters.update
         dt = np.diff(self.time_ns[max(begin - 1, 0) : end]) * 1e-9
         lost = (dt > p.gap * self._usual_s) & (p.gap_rate * dt > _LOST_RAD)
@@ -248,7 +248,7 @@ class SamplePath:
     def _across(
         self, at: int, made: Increments, field: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float] | None:
-        """Turn over the gap after a sample, as of `turn_across`; None with no sample on a side."""
+        """Rotation over the gap after sample `at` by `turn_across`; None if a side is too short."""
         low, high = max(at - self._side, 0), min(at + 1 + self._side, len(self.time_ns) - 1)
         first = max([low, *(self._lost(low + 1, at + 1) + 1)])
         last = min([high, *self._lost(at + 2, high + 1)])
@@ -261,10 +261,10 @@ class SamplePath:
         return turn_across(before, np.asarray(made.theta)[at], after, self._parameters)
 
     def _hung(self, end: int) -> np.ndarray:
-        """(M,) of the samples kept: weight of the turn that gyros which hang up to `end` missed.
+        """Factor (M,) on the uncertainty of rotation of kept samples up to `end` where gyros hang.
 
-        A unit that hangs for some blocks misses one turn, so spreads of blocks add up, not their
-        squares: that of block k is sqrt(2 k - 1) times the first.
+        The errors of successive hanging blocks are fully correlated, so their sigmas add, not their
+        variances: the sigma of the k-th is sqrt(2 k - 1) times that of the first.
         """
         out = np.zeros(len(self.rows))
         if self._kind != "rate":
@@ -279,7 +279,7 @@ class SamplePath:
     def _steps(
         self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray
     ) -> MargSteps:
-        """Integrate blocks, and add what is known at their ends."""
+        """Integrate blocks, and add the measurements at their ends."""
         p = self._parameters
         integrals, field_b = model.integrate(samples)
         times, rate = np.asarray(integrals.dt_s).tolist(), mean_rate(integrals)
@@ -299,14 +299,13 @@ class SamplePath:
     def _not_sampled(
         self, dt: np.ndarray, full: np.ndarray, doubt: np.ndarray, accel_full: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Spread of the turn that intervals did not show (N, 3) [rad], and seconds of specific
-        force that they did not show (N,).
+        """Sigma (N, 3) [rad] of unmeasured rotation, and time (N,) [s] without specific force.
 
         Args:
             dt: (N,) s, intervals between N + 1 samples.
-            full: (N + 1, 3) bool, a gyro at the end of its range, and
-            doubt: (N + 1, 3) rad/s, spread of what was put back; NaN where nothing.
-            accel_full: (N + 1,) bool.
+            full: (N + 1, 3) bool, gyro at the end of its range.
+            doubt: (N + 1, 3) rad/s, sigma of restored rates; NaN where not restored.
+            accel_full: (N + 1,) bool, accelerometer at the end of its range.
         """
         p = self._parameters.update
         gap = np.where(dt > p.gap * self._usual_s, dt, 0.0)
@@ -314,30 +313,28 @@ class SamplePath:
         known = np.isfinite(doubt)
         unknown = full & ~known
         lost = gap + dt * (accel_full[1:] | accel_full[:-1])
-        # turn that a gyro at its end did not report, about its own axis; that of all samples in a
-        # gap
+        # a saturated gyro misses rotation about its own axis, a gap about all three
         turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
         return turn + dt[:, None] * np.where(known, doubt, 0.0)[1:], lost
 
     def _measurements(
         self, u: model.Block, field_b: np.ndarray, sigma: np.ndarray, looks: Sequence[Look]
     ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
-        """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing
-        is.
+        """Measurements y and inputs aux at the end of each of K blocks; y is NaN where missing.
 
         Args:
             u: the blocks.
             field_b: (K, 3) T, mean field in body axes at the end of each.
             sigma: (K,) rad/s, of the mean rate at rest.
-            looks: K readings of sites.
+            looks: K results of `Sites.look`.
         """
         p, pace, time = self._parameters, self._pace, np.asarray(u.samples.dt_s)
         clock = np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]
         pace.clock_s = float(clock[-1])
         whole, at_rest = time > 0.0, np.asarray(u.still) > 0.0
         moves, still = whole & ~at_rest, whole & at_rest
-        # Noise that lasts is thinned out: it must be new at each reading to be what the filter
-        # thinks.
+        # Errors of travel are correlated in time: thin out its measurements, as the filter takes
+        # their noise as white.
         travels = pace.take(model.TRAVEL, clock, moves, p.travel.every)
         y: dict[str, Any] = {
             model.TRAVEL: _zeros_where(travels, 6),
@@ -358,30 +355,30 @@ class SamplePath:
 
 
 def _zeros_where(known: np.ndarray, size: int) -> np.ndarray:
-    """Measurements (K, size) that are zero where one is known (K,), else NaN."""
+    """Measurements (K, size): zero where `known` (K,), else NaN."""
     return np.where(known[:, None], np.zeros((len(known), size)), np.nan)
 
 
 def joined(steps: Sequence[MargSteps]) -> MargSteps:
-    """Steps of chunks, one after another."""
+    """Concatenate the steps of chunks."""
     return jax.tree_util.tree_map(lambda *rows: np.concatenate(rows), *steps)
 
 
 def _in_blocks(values: np.ndarray, n: int, blank: float) -> np.ndarray:
-    """Rows (M, ...) as (K, n, ...), the last block filled up."""
+    """Rows (M, ...) as blocks (K, n, ...), the last padded with `blank`."""
     blocks = -(-len(values) // n)
     pad = np.full((blocks * n - len(values), *values.shape[1:]), blank)
     return np.concatenate([values, pad]).reshape(blocks, n, *values.shape[1:])
 
 
 def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
-    """Rates as increments of the sampling intervals that end with them.
+    """Rates as increments over the sampling intervals that they end.
 
-    What a MEMS chip puts out is the mean over its last sampling interval, or later still for its
-    filters; to read it as the rate of that instant would run ahead of the motion by half of one.
+    A MEMS chip outputs the mean over its last sampling interval, or older still due to its filters;
+    taken as the rate at that instant, the attitude would lag the motion by half an interval.
 
     Args:
-        imu: rates, or increments, which are returned.
+        imu: rates; increments are returned unchanged.
         usual_s: s, sampling interval; None: that of the table.
     """
     if imu.kind == "increment":
@@ -394,15 +391,15 @@ def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
 
 
 class MeasurementPace:
-    """Times of the last use of travel and field, so that they are used once in an interval."""
+    """Scheduler that limits measurements of travel and field to one per interval."""
 
     def __init__(self) -> None:
-        """Start without any use."""
-        self.clock_s = 0.0  # end of the last block
+        """Create a scheduler without a past measurement."""
+        self.clock_s = 0.0  # end of the last block [s]
         self.due_s = {model.TRAVEL: -np.inf, model.MAGNETOMETER: -np.inf}
 
     def take(self, name: str, clock_s: np.ndarray, able: np.ndarray, every_s: float) -> np.ndarray:
-        """Mask (K,) of the blocks to take so that about `every_s` lies between two."""
+        """Mask (K,) of the usable blocks (`able`) to measure in, at least about `every_s` apart."""
         out = np.zeros(len(clock_s), dtype=bool)
         for k in np.flatnonzero(able):
             if clock_s[k] >= self.due_s[name]:
@@ -412,7 +409,7 @@ class MeasurementPace:
 
 
 def _of_site(look: Look, parameters: MargReplay) -> np.ndarray:
-    """(4 + SITES,) field in body axes, sigma of its azimuth and which site it is."""
+    """Input aux of "revisit" (4 + SITES,): field in body axes, sigma of azimuth, site as 0/1."""
     site, field_b, dip = look
     leaning = np.tan(min(abs(dip), 1.5)) * parameters.stated.tilt
     sigma = np.hypot(parameters.magnetometer.site, leaning)
@@ -420,13 +417,13 @@ def _of_site(look: Look, parameters: MargReplay) -> np.ndarray:
 
 
 def mean_rate(integrals: model.Integrals) -> np.ndarray:
-    """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
+    """Mean rate (K, 3) [rad/s] of each block, from its rotation; for small angles, as at rest."""
     q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
     return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
 
 
 def mean_force(integrals: model.Integrals) -> np.ndarray:
-    """(K, 3) m/s^2, mean specific force of each block."""
+    """Mean specific force (K, 3) [m/s^2] of each block, in body axes at its start."""
     dt = np.asarray(integrals.dt_s)[:, None]
     return np.asarray(integrals.dv) / np.where(dt > 0.0, dt, 1.0)

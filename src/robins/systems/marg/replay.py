@@ -1,6 +1,6 @@
-"""The replay of a nine-axis log, and its errors where the truth is known.
+"""Replay of a nine-axis log, and its errors if the truth is known.
 
-Errors of an orientation are those that BROAD defines (Laidig, Caruso, Cereatti & Seel 2021).
+Orientation errors are defined as in BROAD (Laidig, Caruso, Cereatti & Seel 2021).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from robins.systems.study import Contender, StateBlock
 from robins.systems.tables import EULER, SensorUpdates, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
-# the azimuth of a site that was never visited is not known, and those of others are in the heading
+# site azimuths are not reported: unvisited ones are unknown, the others show in the heading
 _BLOCKS = tuple(block for block in model.BLOCKS if block.name != "azimuths")
 _ESTIMATED = {block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in _BLOCKS[1:]}
 _HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
@@ -43,8 +43,8 @@ _INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("nor
 class OrientationErrors(NamedTuple):
     """Angles [rad] of q_e = q_estimated conj(q_true), both from body to an earth frame.
 
-    Neither depends on which of the earth's axes is called first, so ENU and NED give the same, but
-    for the sign of the heading error, which here is clockwise as headings are.
+    ENU and NED give the same values, except for the sign of the heading error, which here is
+    clockwise as headings are.
     """
 
     total: np.ndarray  # (N,) 0 to pi
@@ -70,10 +70,10 @@ def orientation_errors(q_estimated: np.ndarray, q_true: np.ndarray) -> Orientati
 
 
 def truth_at(attitude: AttitudeTable, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """True q_nb (N, 4) NED at given times and whether they count; NaN where none is near.
+    """True q_nb (N, 4), NED, at given times, NaN if none is near; and mask (N,) of counted ones.
 
-    The nearest true attitude within half its own interval is taken, none is interpolated. A phase
-    counts where the author of the log marked it, everywhere if nothing is marked.
+    The nearest true attitude within half a sampling interval is taken, without interpolation. Only
+    the phases marked by the author of the log count, or all if none is marked.
     """
     table = to_ned_frd(attitude)
     times = table.time_ns
@@ -89,12 +89,12 @@ def truth_at(attitude: AttitudeTable, time_ns: np.ndarray) -> tuple[np.ndarray, 
 
 
 def rms_deg(angle_rad: np.ndarray) -> float:
-    """Root of the mean square [deg]; NaN of nothing."""
+    """Root mean square [deg] of angles [rad]; NaN if there are none."""
     return float(np.degrees(np.sqrt(np.mean(angle_rad**2)))) if angle_rad.size else float("nan")
 
 
 class Errors(NamedTuple):
-    """True minus estimated at the ends of blocks."""
+    """Errors, true minus estimated, at the ends of blocks."""
 
     heading: np.ndarray  # (B,) rad
     tilt: np.ndarray  # (B, 2) rad, about north and east
@@ -102,17 +102,17 @@ class Errors(NamedTuple):
 
 
 def contender(parameters: MargReplay, name: str) -> Contender:
-    """The filter with the model it believes in.
+    """The filter "marg" with its model.
 
     Raises:
-        ValueError: another is requested.
+        ValueError: another filter is requested.
     """
     require_known("filter", name, (CAUSAL,), "this system, which smooths replays only")
     return Contender(filter_of(parameters), model.model_of(parameters))
 
 
 def recorded(dataset: Dataset, parameters: MargReplay) -> PreparedLog:
-    """The log as its filter takes it, see `System.recorded`.
+    """The log prepared for its filter, see `System.recorded`.
 
     Raises:
         ValueError: the log cannot be used; the message gives the reason.
@@ -126,7 +126,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = ignore_progress,
 ) -> Outcome:
-    """Find the orientation over a log, with and without a true attitude; see `System.replay`.
+    """Estimate the orientation over a log, with errors if its truth is known; see `System.replay`.
 
     Raises:
         ValueError: the log cannot be used; the message gives the reason.
@@ -154,7 +154,7 @@ def replay(
             return share
         moving = errors[answer.name].counts
         ratio = errors[answer.name].heading[moving] / answer.sigma[moving, 2]
-        # one where the stated spread of the heading is right
+        # one if the stated sigma of the heading is right
         nees = float(np.mean(ratio**2)) if ratio.size else float("nan")
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
@@ -192,8 +192,8 @@ def _about_north(dataset: Dataset, north: float | None) -> list[str]:
 def _answers(
     log: PreparedMargLog, parameters: MargReplay, wanted: Sequence[str], progress: Progress
 ) -> tuple[dict[str, FilterEstimates], dict[str, Mapping[str, SensorUpdates]]]:
-    """Estimates of filters and smoother by name, and the updates that each can be doubted by."""
-    # the causal run is needed too: it finds out what gyros these are
+    """Estimates of filters and smoother, and the updates by which to monitor each, by name."""
+    # the smoother needs the causal run: it decides whether the gyros are uncalibrated
     causal = dict.fromkeys([*wanted, CAUSAL])
     causal.pop(SMOOTHED, None)
     make = partial(contender, parameters)
@@ -208,7 +208,7 @@ def _answers(
 def _doubt(
     answer: FilterEstimates, seen: Mapping[str, SensorUpdates], parameters: MargReplay
 ) -> monitor.Contradictions:
-    """Contradictions of an answer with the parameters."""
+    """Contradictions of estimates with the parameters."""
     return monitor.doubts_of(
         np.asarray(answer.mean.declination),
         np.asarray(answer.mean.gyro_gain),
@@ -221,7 +221,7 @@ def _doubt(
 def _smoothed(
     log: PreparedMargLog, causal: FilterEstimates, parameters: MargReplay, progress: Progress
 ) -> tuple[FilterEstimates, Mapping[str, SensorUpdates]]:
-    """The smoother, for the gyros the causal run ended with, and the updates of what it smooths."""
+    """Smoother with the gyro prior that the causal run ended with, and updates of its filter."""
     start, bare = log.world.start, bool(np.asarray(causal.wrong[BARE])[-1] > 0.5)
     if bare:
         factor, gains = np.array(start.factor), np.arange(model.DIM)[model.GAINS]
@@ -236,10 +236,10 @@ def _smoothed(
 
 
 def true_north(dataset: Dataset) -> float | None:
-    """Declination [rad] of the Earth's field by the WMM at the first fix; None where none is.
+    """Declination [rad] of the Earth's field by the WMM at the first fix.
 
-    None too where the log has no date: a stamp that counts from the start of a recording is
-    outside the life of every model.
+    None without a fix, a magnetometer or a date: stamps that count from the start of a recording
+    are outside the validity of every model.
     """
     gnss = dataset.gnss
     if gnss is None or dataset.mag is None:
@@ -258,7 +258,7 @@ def true_north(dataset: Dataset) -> float | None:
 
 
 def _turned_north(q_nb: np.ndarray, declination: float) -> np.ndarray:
-    """Attitudes counted from the north of the field, counted from true north."""
+    """Convert attitudes (..., 4) from magnetic to true north."""
     turn = np.array([math.cos(declination / 2.0), 0.0, 0.0, math.sin(declination / 2.0)])
     return np.asarray(rotation.multiply(turn, q_nb))
 
@@ -287,7 +287,7 @@ def _by_sample(log: PreparedMargLog, answer: FilterEstimates) -> np.ndarray:
 def _as_stated(
     log: PreparedMargLog, answer: FilterEstimates, parameters: MargReplay
 ) -> FilterEstimates:
-    """The answer as NumPy arrays, its attitude as sure as is stated."""
+    """Estimates as NumPy arrays, with `stated_sigma`."""
     kept = answer.mean, answer.sigma, answer.updates
     mean, sigma, seen = jax.tree_util.tree_map(np.asarray, kept)
     samples = log.world.u.samples
@@ -298,13 +298,13 @@ def _as_stated(
 def stated_sigma(
     sigma: np.ndarray, turned: np.ndarray, lasted: np.ndarray, parameters: MargReplay
 ) -> np.ndarray:
-    """(B, n) standard deviations, those of attitude with what no state carries.
+    """Standard deviations (B, n), with `StatedErrors` added to those of attitude.
 
     Args:
         sigma: (B, n) of the filter, attitude first.
-        turned: (B,) rad, in each block.
-        lasted: (B,) s.
-        parameters: what is stated.
+        turned: (B,) rad, angle turned in each block.
+        lasted: (B,) s, duration of each block.
+        parameters: have the stated errors.
     """
     stated = parameters.stated
     late = stated.delay * turned / lasted
@@ -341,7 +341,7 @@ def _accuracy(q_nb: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> dict[
 
 
 def _errors(q: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> Errors:
-    # how the true vertical leans against the estimated one, along estimated north and east
+    # tilt of the true vertical relative to the estimated one, about estimated north and east
     true_down = rotation.to_dcm(q_true)[:, 2]
     north, east, _ = np.moveaxis(rotation.to_dcm(q), 1, 0)
     tilt = np.stack([np.sum(east * true_down, axis=1), -np.sum(north * true_down, axis=1)], axis=1)
@@ -363,7 +363,7 @@ def _error_arrays(
 
 
 def _refused(log: PreparedMargLog, answer: FilterEstimates) -> np.ndarray:
-    """(B,) bool: the magnetometer was refused."""
+    """Mask (B,) of blocks whose magnetometer measurement was refused."""
     update = answer.updates.get(model.MAGNETOMETER)
     none = np.zeros(len(log.rows), dtype=bool)
     return none if update is None else update.code == int(Code.REFUSED)
@@ -388,7 +388,7 @@ def _variables(
 
 
 def _attitudes(log: PreparedMargLog, q_nb: Mapping[str, np.ndarray]) -> Variables:
-    """Attitude at every sample, on a clock of its own."""
+    """Attitude at every sample, with its own time axis."""
     since_s = (log.time_ns - log.time_ns[0]) * 1e-9
     clock = variable("sample_time", since_s, "s", "time of the inertial samples")
     words = "estimated attitude at every sample"

@@ -1,9 +1,9 @@
-"""Detection of rest by blocks of samples: from spread and constancy, not from the mean rate.
+"""Detection of rest by blocks of samples: from scatter and constancy, not from the mean rate.
 
-A gyro of a cheap unit reads some degrees a second at rest, and a slow turn reads the same. The
-difference: at rest the rate is constant, the specific force keeps its direction in the unit,
-and so does the magnetic field. So the mean rate counts from a bias that rest has shown before, and
-a rest that shows a new one must last longer, unless the log begins with it.
+A low-cost gyro reads several degrees per second at rest, and so does a slow turn. The difference:
+at rest the rate is constant, and specific force and magnetic field keep their directions in body
+axes. The mean rate is therefore compared with the last bias found at rest, and a rest with a new
+bias must last longer, unless the log begins with it.
 """
 
 from __future__ import annotations
@@ -12,35 +12,35 @@ import numpy as np
 
 from robins.systems.marg.parameters import Rest
 
-_SHORT = 3  # blocks, below which there is no decision
+_SHORT = 3  # blocks; no detection over fewer
 
 
 class RestDetector:
     """Detector of rest, block by block.
 
     A quiet spell is one in which rate and specific force stay near their means over the last
-    `rest.after`, and the field near the one the spell began with. It is rest once it has lasted
-    `rest.after`, if its mean rate is within `rest.most_rate` of the bias that rest has shown last;
-    otherwise, up to `rest.most_bias`, once it has lasted `rest.new_bias`, and then shows a new
-    bias. The spell that the log begins with shows one at once.
+    `rest.after`, and the field near that at the start of the spell. It is rest once it has lasted
+    `rest.after`, if its mean rate is within `rest.most_rate` of the last bias found at rest. A mean
+    rate further off, up to `rest.most_bias`, is a new bias once the spell has lasted
+    `rest.new_bias`, or `rest.after` if the log begins with it.
 
     Attributes:
-        first: (3,) rad/s, mean rate of the rest that the log begins with; None where there is none,
-            or not yet.
-        first_sigma: rad/s, of that mean.
+        first: (3,) rad/s, mean rate of the rest that the log begins with; None if there is none,
+            or it is not yet known.
+        first_sigma: rad/s, sigma of that mean.
     """
 
     def __init__(self, usual_s: float, rest: Rest):
-        """Begin.
+        """Create a detector at time zero.
 
         Args:
-            usual_s: s, usual length of a block.
+            usual_s: s, usual duration of a block.
             rest: thresholds.
         """
         self._usual_s, self._rest = usual_s, rest
         self._width = round(rest.after / usual_s) if usual_s > 0.0 else 0
         self._able = rest.detect and self._width >= _SHORT
-        self._rate, self._force = np.zeros((0, 3)), np.zeros((0, 3))  # of the spell, the last width
+        self._rate, self._force = np.zeros((0, 3)), np.zeros((0, 3))  # last blocks of the spell
         self._bias, self._held = np.zeros(3), np.full(3, np.nan)
         self._clock_s, self._began_s, self._unbroken = 0.0, 0.0, True
         self.first: np.ndarray | None = None
@@ -48,26 +48,25 @@ class RestDetector:
 
     @property
     def settled(self) -> bool:
-        """True if it is known how the log begins: at rest, which lasts `rest.after`, or not."""
+        """True once it is known whether the log begins with a rest of at least `rest.after`."""
         return not (self._able and self._unbroken) or self.first is not None
 
     def look(
         self, dt_s: float, rate: np.ndarray, force: np.ndarray, field: np.ndarray
     ) -> tuple[bool, float]:
-        """Decide whether the unit lies still in the next block, with the spread of its rate
-        [rad/s].
+        """Process a block: True if the unit is at rest in it, and sigma of its mean rate [rad/s].
 
         Args:
-            dt_s: s, length of the block.
+            dt_s: s, duration of the block.
             rate: (3,) rad/s, mean over it.
             force: (3,) m/s^2, mean specific force.
-            field: (3,) T in body axes; NaN where there is none.
+            field: (3,) T in body axes; NaN if there is none.
         """
         rest = self._rest
         self._clock_s += dt_s
         if not self._able:
             return False, rest.rate
-        # one block is too little for a decision; a pair that differs breaks the spell
+        # one block does not suffice for a decision; two that differ end the spell
         self._rate = np.concatenate([self._rate, rate[None]])[-self._width :]
         self._force = np.concatenate([self._force, force[None]])[-self._width :]
         mean_rate, mean_force = self._rate.mean(axis=0), self._force.mean(axis=0)

@@ -1,17 +1,17 @@
-"""Gyros at the end of their range: found where the range is not given, and bridged.
+"""Gyro saturation: detection of an unknown range, and restoration of clipped peaks.
 
-A signal that is cut off jumps to a level, stays, and leaves it by a jump. A smooth peak that fills
-two samples within 0.5 % of its height has its next sample within 4.5 % of it (of a sine: half an
-interval is at most 0.1 rad, and cos 0.3 is 0.955); so a level that is reached or left by a jump of
-more, twice, is the end of the range.
+A clipped signal jumps to a level, stays there, and leaves it by a jump. A smooth peak with two
+samples within 0.5 % of its height has its next sample within 4.5 % of it (for a sine, half an
+interval is at most 0.1 rad, and cos 0.3 is 0.955); so a level that is reached or left twice by a
+larger jump is the end of the range.
 
-Where the chip filters after it cuts off, there is no jump, but a plateau: the same law over more
-samples. What stays within 0.5 % for d seconds and is more than 5 % lower d before and d after is
-cut off. It has to last 0.08 s, since the peak of a hand's motion can be flatter than a sine, and
-0.4 s at most: a machine that turns at one rate does so for longer.
+If the chip filters after clipping, there is no jump, but a plateau, to which the same rule applies
+over more samples. A signal that stays within 0.5 % for d seconds and is more than 5 % lower d
+before and d after is clipped. It must last 0.08 s, since the peak of a hand's motion can be flatter
+than a sine, and at most 0.4 s: a machine that turns at a constant rate does so for longer.
 
-A replay finds levels over the whole log: a peak before the first that shows the range is put back
-too. A live object finds them sample by sample (`GyroRange`).
+A replay finds levels over the whole log, so peaks before the first that reveals the range are
+restored too. A live object finds them sample by sample (`GyroRange`).
 """
 
 from __future__ import annotations
@@ -20,28 +20,27 @@ import numpy as np
 
 from robins.systems.suspects import edges
 
-_LEVEL = 0.005  # share of the level that its samples lie within
-_JUMP = 0.05  # share of the level, more than a smooth peak can fall by
-_LEAST_RATE = 1.0  # rad/s; no gyro ends below
+_LEVEL = 0.005  # relative scatter of samples at the level
+_JUMP = 0.05  # share of the level; a smooth peak falls by less in a sample
+_LEAST_RATE = 1.0  # rad/s; no gyro has a smaller range
 _OFTEN = 2  # jumps to or from the level
-_PLATEAU_S = (0.08, 0.4)  # s, that a level without jumps may last; a machine turns for longer
-_KEPT_PAIRS = 100  # of samples at the level, more than a peak has
-LONGEST_S = 0.2  # s, of a peak that is bridged
-FLANK = 3  # samples on either side, by which it is
-_FROZEN_SAMPLES = 5  # of a block, below which repeated numbers mean nothing
-_TURNS = np.radians(10.0)  # rad/s, more than a bias
-_OF_CHANGE = 0.02  # weight of a block in the usual difference of two samples
-_SHAKEN = 0.5  # m/s^2, range of the specific force in a block of a unit that moves
-_MISSED = 0.3  # of what a bridge adds: the share that it may err by
+_PLATEAU_S = (0.08, 0.4)  # s, shortest and longest plateau; a machine turns for longer
+_KEPT_PAIRS = 100  # pairs of samples at the level; more than in a peak
+LONGEST_S = 0.2  # s, longest peak that is restored
+FLANK = 3  # samples on each side used for that
+_FROZEN_SAMPLES = 5  # samples of a block; fewer repeated values are no evidence
+_TURNS = np.radians(10.0)  # rad/s; larger than any bias
+_OF_CHANGE = 0.02  # weight of a block in the running mean difference of successive samples
+_SHAKEN = 0.5  # m/s^2; the specific force varies more in a block of a moving unit
+_MISSED = 0.3  # relative sigma of the rate added by restoration
 
 
 def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
-    """(3, 2) rad/s: largest negative and positive rate that an axis can read; infinite where
-    none shows.
+    """Magnitudes (3, 2) [rad/s] of the negative and positive end of each range; inf if unknown.
 
     Args:
         rate: (N, 3) rad/s.
-        step_s: s, between samples; 0: no plateaus are looked for.
+        step_s: s, sampling interval; 0: do not search for plateaus.
     """
     out = np.full((3, 2), np.inf)
     for axis in range(3):
@@ -57,13 +56,13 @@ def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
             if jumps >= _OFTEN:
                 out[axis, side] = (1.0 - _LEVEL) * top
             elif _has_plateau(x, top, step_s):
-                # filtered, it is not quite level
+                # a filtered plateau is not quite level
                 out[axis, side] = (1.0 - 2.0 * _LEVEL) * top
     return out
 
 
 def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
-    """True if a stay at the top of (N,) is that of a range and of no smooth peak."""
+    """True if the signal (N,) has a plateau at `top` that no smooth peak has."""
     for begin, end in edges(x > (1.0 - _LEVEL) * top):
         long = end - 1 - begin
         before, after = begin - long, end - 1 + long
@@ -75,25 +74,25 @@ def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
 
 
 class GyroRange:
-    """The end of each gyro's range and its least step, as the samples so far show them.
+    """Ends of each gyro's range and its resolution, found from the samples so far.
 
     Attributes:
-        levels: (3, 2) rad/s, as of `levels`.
+        levels: (3, 2) rad/s, as in the function `levels`.
     """
 
     def __init__(self, levels: np.ndarray | None = None) -> None:
-        """Begin with no levels, or with those of a whole log, which are read from no sample."""
-        self._last = np.zeros((0, 3))  # rad/s, the last three
-        self._top = np.zeros(6)  # rad/s, largest of each axis, positive; then negative
-        # of each: pairs that lie at its top, with the samples before and after
+        """Create with unknown levels, or with given ones of a whole log."""
+        self._last = np.zeros((0, 3))  # rad/s, the last three samples
+        self._top = np.zeros(6)  # rad/s, largest positive rate of each axis, then negative
+        # for each: pairs at its top (lower of the two, sample before, sample after)
         self._pairs: list[np.ndarray] = [np.zeros((0, 3))] * 6
         self.levels = np.full((3, 2), np.inf) if levels is None else levels
-        self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
-        self._change = np.full(3, np.nan)  # rad/s, usual difference of two samples
-        self._hung = 0  # blocks in a row, up to the last, that end in gyros that hang
+        self._step = np.full(3, np.inf)  # rad/s, least nonzero difference on each axis
+        self._change = np.full(3, np.nan)  # rad/s, mean difference of successive samples
+        self._hung = 0  # successive hanging blocks up to the last
 
     def read(self, rate: np.ndarray) -> None:
-        """Take the next sample (3,) rad/s."""
+        """Process the next sample (3,) [rad/s]."""
         window = np.concatenate([self._last, rate[None]])
         self._last = window[-3:]
         new = np.concatenate([rate, -rate])
@@ -115,18 +114,19 @@ class GyroRange:
             self.levels[k % 3, int(k < 3)] = (1.0 - _LEVEL) * top if jumps >= _OFTEN else np.inf
 
     def hanging(self, rate: np.ndarray, accel: np.ndarray) -> int:
-        """Judge the samples of a block: whether the gyros repeat one turn while the unit is shaken.
+        """Detect gyros that repeat one rate during a block while the unit is shaken.
 
-        A converter or a driver that hangs hands out its last numbers again, give or take one step
-        of the least digit. So does a unit that does not turn, and one whose noise is less than a
-        step: gyros hang only where they read a turn, and changed from sample to sample before.
+        A converter or driver that hangs repeats its last values, within one least significant
+        digit. So does a unit that does not turn, or one with noise below that digit: gyros hang
+        only if they read a turn, and varied from sample to sample before.
 
         Args:
-            rate: (n + 1, 3) rad/s, with the last sample before the block.
+            rate: (n + 1, 3) rad/s, from the last sample before the block on.
             accel: (n + 1, 3) m/s^2.
 
         Returns:
-            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
+            Number of successive hanging blocks up to this one, including the block after the last,
+            which may begin so; 0 if the gyros do not hang.
         """
         change = np.abs(np.diff(rate, axis=0))
         known, usual = self._step, self._change
@@ -144,17 +144,17 @@ class GyroRange:
             share = 1.0 if np.any(np.isnan(usual)) else _OF_CHANGE
             self._change = np.where(np.isnan(usual), 0.0, usual) * (1.0 - share)
             self._change = self._change + share * change.mean(axis=0)
-        # the block after the last may begin so
+        # the block after the last hanging one may begin so
         return self._hung or (before + 1 if before else 0)
 
 
 def beyond(rate: np.ndarray, levels: np.ndarray, most: float) -> np.ndarray:
-    """(N, 3) bool: rates (N, 3) [rad/s] at the end of a range.
+    """Mask (N, 3) of rates at the end of a range.
 
     Args:
-        rate: to compare.
-        levels: (3, 2) rad/s as of `levels`.
-        most: rad/s, end of the range by the data sheet.
+        rate: (N, 3) rad/s.
+        levels: (3, 2) rad/s, as in the function `levels`.
+        most: rad/s, range by the data sheet.
     """
     limit = np.minimum(levels, 0.99 * most)
     return (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
@@ -163,10 +163,10 @@ def beyond(rate: np.ndarray, levels: np.ndarray, most: float) -> np.ndarray:
 def bridged(
     time_ns: np.ndarray, rate: np.ndarray, full: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Put back the peaks that the range cut off.
+    """Restore peaks clipped at the end of the range.
 
-    A peak is the cubic that leaves the last good sample and meets the next good one with the slopes
-    of its flanks. A longer one than `LONGEST_S` is left at its level.
+    A peak is the cubic through the last good sample before and the first after it, with the slopes
+    of the flanks. Peaks longer than `LONGEST_S` stay clipped.
 
     Args:
         time_ns: (N,) int64.
@@ -174,7 +174,7 @@ def bridged(
         full: (N, 3) bool, at the end of the range.
 
     Returns:
-        (N, 3) rad/s, and the standard deviation of what was put back (N, 3); NaN where nothing.
+        Rates (N, 3) [rad/s], and standard deviation (N, 3) of the restored ones; NaN elsewhere.
     """
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Start of the filter of a unit: level, north by the field, the bias by rest."""
+"""Initial belief of the filter: levelling, north from the field, gyro bias from rest."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from robins.systems.marg import model
 from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.rest import RestDetector
 
-# a unit at rest, by its first samples
-_STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
-_STILL_SPREAD = np.radians(1.0)  # rad/s, mean length of its changes
-_STILL_FORCE = 0.5  # m/s^2
-_BIASES = 3.0  # standard deviations of the bias, beyond which a scale is off
-_SCALE = 0.1  # share of gravity that it may be off by
+# limits for rest over the first samples
+_STILL_RATE = np.radians(8.0)  # rad/s, mean magnitude of the rate
+_STILL_SPREAD = np.radians(1.0)  # rad/s, mean absolute deviation of the rate
+_STILL_FORCE = 0.5  # m/s^2, standard deviation on an axis
+_BIASES = 3.0  # sigmas of the bias; a larger error of gravity is one of scale
+_SCALE = 0.1  # largest scale error, as a share of gravity
 
 
 class FilterStart(NamedTuple):
-    """Start of the filter."""
+    """Initial attitude, field and gravity, with sigmas of tilt and heading [rad]."""
 
     q_nb: np.ndarray  # (4,)
-    field_t: np.ndarray  # (2,) T along the horizontal and down; zeros where no field was seen
+    field_t: np.ndarray  # (2,) T, horizontal and down; zeros without a field
     tilt_rad: float
     heading_rad: float
-    gravity: float  # m/s^2, as the accelerometers read it
+    gravity: float  # m/s^2, as read by the accelerometers
     still: bool
     sentence: str
 
 
 def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
-    """q_nb (4,) for which specific force points up and the field north.
+    """Attitude q_nb (4,) for which specific force points up and the horizontal field north.
 
-    Without a field, or with one along the vertical, some heading.
+    Without a field, or with a vertical one, the heading is arbitrary.
     """
     level = np.eye(3)[np.argmin(np.abs(force_b))]
     north = level if field_b is None else field_b
@@ -55,13 +55,13 @@ def initial_alignment(
 ) -> FilterStart:
     """Align on the first samples: a short while of rest, or a longer one of motion.
 
-    In motion the gyros carry specific force and field back to the first sample, so that a swing
-    averages out.
+    Specific force and field are rotated by the gyros into the axes of the first sample, so that
+    the accelerations of motion average out.
 
     Args:
         increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
-        field_b: (N, 3) T, NaN where none.
-        parameters: of the start, and gravity.
+        field_b: (N, 3) T, NaN where missing.
+        parameters: of the start and of gravity.
     """
     dt, theta, dv = increments[:3]
     start, time = parameters.start, np.cumsum(dt)
@@ -111,19 +111,19 @@ def turn_across(
     after: tuple[Increments, np.ndarray],
     parameters: MargReplay,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Turn over a gap, by gravity and the field on both sides of it.
+    """Rotation over a gap, from gravity and the field on both sides of it.
 
-    Where one side has no field, gravity gives the tilt and the heading is that of the bridge.
+    If a side has no field, gravity gives the tilt, and `bridge` the heading.
 
     Args:
-        before: increments up to the gap, and field (N, 3) [T]; as of `initial_alignment`.
-        bridge: (3,) rad, the turn by the rates at the ends of the gap.
+        before: increments up to the gap, and field (N, 3) [T]; as in `initial_alignment`.
+        bridge: (3,) rad, rotation interpolated from the rates at the ends of the gap.
         after: the same after the gap.
         parameters: of the start.
 
     Returns:
-        Rotation vector (3,) [rad], direction of up at the start of the gap (3,), both in body axes
-        there, and the spread of the turn [rad]; infinite where its heading is not known.
+        Rotation vector (3,) [rad] and up direction (3,), both in body axes at the start of the gap,
+        and sigma of the rotation [rad]; infinite if the heading is unknown.
     """
     first, last = (initial_alignment(*side, parameters) for side in (before, after))
     start, end = (SciRotation.from_quat(np.roll(one.q_nb, -1)) for one in (first, last))
@@ -139,7 +139,7 @@ def turn_across(
 
 
 def _turned(theta: np.ndarray) -> SciRotation:
-    """Attitude before each interval and after the last, against the first."""
+    """Attitude before each interval and after the last, relative to the first."""
     out = [SciRotation.identity()]
     for step in SciRotation.from_rotvec(theta):
         out.append(out[-1] * step)
@@ -149,15 +149,15 @@ def _turned(theta: np.ndarray) -> SciRotation:
 def first_belief(
     look: FilterStart, parameters: MargReplay, rest: RestDetector | None = None
 ) -> Belief:
-    """The belief at the first sample.
+    """Initial belief at the first sample.
 
-    Only heading and declination are correlated: what the field of the start is turned by against
-    the mean of the places to come, the heading is wrong by.
+    Only heading, declination and the azimuth of the first site are correlated: if north is the mean
+    of the field over all places, the declination at the start is an error of the heading.
 
     Args:
-        look: at the first samples.
-        parameters: of the start and of what was not looked at.
-        rest: where the samples begin with rest, their mean rate is the bias.
+        look: alignment on the first samples.
+        parameters: of the start and of the other states.
+        rest: detector; if the samples begin with rest, their mean rate is the bias.
     """
     p = parameters
     bias, bias_sigma = jnp.zeros(3), p.gyro.bias
@@ -176,7 +176,7 @@ def first_belief(
         gravity=jnp.asarray(look.gravity),
     )
     known = bool(np.any(look.field_t != 0.0))
-    # where north is the field of the start, its declination is none but for a first noise
+    # if north is the field at the start, its declination is zero but for a small initial error
     bend = p.magnetometer.declination
     if not known or p.start.north == "start":
         bend = bend / (20.0 if look.still else 2.0)
@@ -198,6 +198,6 @@ def first_belief(
         factor[model.HEADING, model.HEADING] = heading
         factor[model.DECLINATION, model.HEADING] = bend**2 / heading
         factor[model.DECLINATION, model.DECLINATION] = bend * look.heading_rad / heading
-    # at the site of the start the field points by its declination
+    # the azimuth of the field at the first site is the initial declination
     factor[model.AZIMUTHS.start] = factor[model.DECLINATION]
     return Belief(mean, jnp.asarray(factor))
