@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C co
 def quick(monkeypatch):
     """Compile without optimisation; the bits are the same."""
     flags = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
-    monkeypatch.setattr("robins.program.memory.build", lambda text, _: build(text, flags))
+    monkeypatch.setattr("robins.program.native.build", lambda text, _: build(text, flags))
 
 
 def test_the_orientation_is_that_by_jax():
