@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -104,14 +105,16 @@ class ResultWriter:
             raise ValueError(f"{name} is written by robins itself")
         if isinstance(content, Path):
             self._moved.append(content)
-            content = content.read_bytes()
         self._write(name, content)
 
-    def _write(self, name: str, content: bytes) -> None:
+    def _write(self, name: str, content: bytes | Path) -> None:
         path = self._stage.path / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            if isinstance(content, Path):
+                shutil.copyfile(content, path)  # piece by piece: a record may be larger than memory
+            else:
+                path.write_bytes(content)
         except OSError as error:
             raise cannot(self.path, f"write {name}", error) from error
 
