@@ -16,6 +16,7 @@ from robins.results import ResultError, ignore_progress
 from robins.systems import replaying
 from robins.systems.gnss import GnssReplay, LiveGnss, gnss_model
 from robins.systems.gnss.filters import SMOOTHERS, contender
+from robins.systems.gnss.live import answer_of
 from robins.systems.gnss.log import arrange, channels_of, names_of
 from robins.systems.gnss.model import (
     LENGTH,
@@ -144,7 +145,10 @@ def test_answers_at_epochs_have_the_bits_of_a_replay(live, log, replayed, late_s
     heading = np.array([one.heading_rad for one in passed])
     known = np.isfinite(heading)
     assert known.any()
-    assert not known[0]  # nothing tells the heading of a vehicle that stands
+    o = log.odometry
+    stands = time_ns <= o.time_ns[np.argmax(o.speed_mps != 0.0)]
+    assert stands.sum() > 5
+    assert not known[stands].any()  # nothing tells the heading of a vehicle that stands
     np.testing.assert_array_equal(
         heading[known], [math.atan2(c[1], c[0]) for c in direction[known]]
     )
@@ -227,17 +231,106 @@ def test_a_new_satellite_forgets_the_delay_of_its_column():
     assert abs(P[k + 1, k - 1]) > 1e-3  # the others keep what they share
 
 
-def test_in_reverse_it_goes_back(live, log):
+@pytest.mark.parametrize("c", [(0.0, 0.0), (0.0, -1.3e-20), (1e-9, 0.0)])
+def test_a_direction_without_a_length_is_no_heading(c):
+    x = np.array([0.0] * 3 + [1.0] * 3 + [*c, 0.5, 0.0, 0.0, 0.5])
+    assert np.isnan(answer_of(0, BERLIN, x, Flag(0)).heading_rad)
+    x[6:8] = 0.0, 1.0
+    x[8:12] = 0.01, 0.0, 0.0, 0.04
+    answer = answer_of(0, BERLIN, x, Flag(0))
+    assert answer.heading_rad == pytest.approx(np.pi / 2)
+    assert answer.sigma_heading_rad == pytest.approx(0.1)
+
+
+def test_in_reverse_it_goes_back():
     """A speed below zero moves against the direction, and forgets delays all the same."""
-    built = gnss_model(PARAMETERS, GnssModelKind(), BERLIN, np.zeros((4, 0)))
-    x = GnssState(
-        *map(jnp.asarray, (np.zeros(3), np.array([1.0, 0.0]), 0.0, np.zeros(2))),
-        jnp.zeros(0),
-        jnp.zeros(0),
+    built = gnss_model(PARAMETERS, GnssModelKind(delays=True), BERLIN, np.zeros((4, 0)))
+    still = np.zeros(3), np.array([1.0, 0.0]), 0.0, np.zeros(2), np.zeros(0), np.full(4, 30.0)
+    x = GnssState(*map(jnp.asarray, still))
+    ahead = MotionStep(1.0, 2.0, 0.0, 0.05, 0.002, jnp.zeros(4), jnp.ones(4))
+    back = ahead._replace(speed=-2.0)
+    assert built.motion.step(x, back).position[0] == pytest.approx(-2.0)
+    np.testing.assert_array_equal(
+        built.motion.step(x, back).delay, built.motion.step(x, ahead).delay
     )
-    u = MotionStep(1.0, -2.0, 0.0, 0.05, 0.002, jnp.zeros(4), jnp.zeros(4))
-    assert built.motion.step(x, u).position[0] == pytest.approx(-2.0)
-    assert np.all(np.isfinite(built.motion.noise_factor(x, u)))
+    assert built.motion.step(x, back).delay[0] < 29.0
+    np.testing.assert_array_equal(
+        built.motion.noise_factor(x, back), built.motion.noise_factor(x, ahead)
+    )
+
+
+def test_through_an_outage_it_follows_the_odometry(channels, log):
+    """30 s straight on, a quarter turn, 30 s: a mean over all of it would go across."""
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    step_ns, turn = 100_000_000, np.pi / 2 / 3.0
+    paths = [GnssPath(PARAMETERS, channels, 0.0, patience) for patience in (1.0, math.inf)]
+    found = [[], []]
+    for k in range(661):
+        speed, rate = 10.0, turn if 301 <= k <= 330 else 0.0
+        for path, out in zip(paths, found, strict=True):
+            path.push_odometry(np.array([k * step_ns]), np.array([[speed, rate, 0.05, 0.002]]))
+            if k in (1, 650):
+                path.push_ranges(k * step_ns, names, rows)
+            out += path.steps()
+    live, replayed = found
+    assert len(live) == len(replayed) > 60
+    for (t, one), (at, other) in zip(live, replayed, strict=True):
+        assert t == at
+        jax.tree_util.tree_map(np.testing.assert_array_equal, one, other)
+    x = GnssState(*map(jnp.asarray, (np.zeros(3), np.array([1.0, 0.0]), 0.0, np.zeros(2))),
+                  jnp.zeros(0), jnp.zeros(0))  # fmt: skip
+    motion = gnss_model(PARAMETERS, GnssModelKind(), BERLIN, np.zeros((4, 0))).motion
+    for _, world in live:
+        x = motion.step(x, jax.tree_util.tree_map(jnp.asarray, world.u))
+    radius = 10.0 / turn
+    straight = np.array([30.0, 31.9]) * 10.0 + radius
+    np.testing.assert_allclose(x.position[:2], straight, atol=3.0)
+    assert paths[0].way_m == pytest.approx(649.0, abs=0.5)
+
+
+def test_hours_without_an_epoch_take_no_memory(live):
+    for k in range(3000):
+        live.push_odometry(k * 100_000_000, 5.0, 0.0, 0.05, 0.002)
+    assert len(live._path._odometry) < 30
+
+
+@pytest.mark.parametrize("fault", ["kilometres", "one place", "too few columns"])
+def test_without_a_first_fix_it_does_not_start(live, log, channels, fault):
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    wrong = rows.copy()
+    if fault == "kilometres":
+        wrong[:, :5] /= 1e3
+    elif fault == "one place":
+        wrong[:, 2:5] = wrong[0, 2:5]
+    else:
+        live = LiveGnss(PARAMETERS, {"G": 3, "R": 1})
+        only = [k for k, name in enumerate(names) if name[0] == "G"]
+        names, wrong = [names[k] for k in only], wrong[only]
+    for k in range(2):
+        push(live, EPOCH, (k * 10**9, names, wrong))
+        answer = live.push_odometry(k * 10**9, 0.0, 0.0, 0.1, 0.01)
+        assert answer.flags == Flag.STARTING
+    assert live.counts["ranges_without_fix"] == (0 if fault == "too few columns" else 2)
+    if fault != "too few columns":
+        push(live, EPOCH, (2 * 10**9, names, rows))
+        answer = live.push_odometry(2 * 10**9, 0.0, 0.0, 0.1, 0.01)
+        assert answer.flags == Flag(0)
+        assert np.all(np.isfinite(answer.r_e))
+
+
+def test_a_clock_that_was_set_begins_anew(live, log):
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    push(live, EPOCH, (0, names, rows))
+    live.push_odometry(0, 0.0, 0.0, 0.1, 0.01)
+    far = 10**17
+    assert live.push_odometry(far, 0.0, 0.0, 0.1, 0.01).flags & Flag.REFUSED
+    assert live.push_odometry(10**8, 0.0, 0.0, 0.1, 0.01).flags == Flag(0)
+    for k in range(10):
+        answer = live.push_odometry(far + k * 10**8, 0.0, 0.0, 0.1, 0.01)
+    assert live.counts["begun_anew"] == 1
+    assert answer.flags == Flag.STARTING
+    push(live, EPOCH, (far + 9 * 10**8, names, rows))
+    assert live.push_odometry(far + 10**9, 0.0, 0.0, 0.1, 0.01).flags == Flag(0)
 
 
 def test_bad_records_are_refused_and_counted(live, log):
@@ -273,6 +366,14 @@ def test_bad_records_are_refused_and_counted(live, log):
         live.push_odometry(True, 1.0, 0.0, 0.1, 0.01)
     with pytest.raises(LiveError, match="by its name, once"):
         push(live, EPOCH, (t + 2, [names[0]] * len(names), rows))
+    with pytest.raises(LiveError, match="by its name, once"):
+        push(live, EPOCH, (t + 2, [["G"], *names[1:]], rows))
+    with pytest.raises(LiveError, match="satellite_e"):
+        live.push_ranges(t + 2, names, *rows[:, :2].T, rows[:, 2:5].T, *rows[:, 5:].T)
+    with pytest.raises(LiveError, match="is no time"):
+        live.push_odometry(2**63, 1.0, 0.0, 0.1, 0.01)
+    assert push(live, EPOCH, (t + 2, [], rows[:0])).flags & Flag.REFUSED
+    assert live.counts["ranges_empty"] == 1
     with pytest.raises(LiveError, match="range_m"):
         push(live, EPOCH, (t + 2, names[:3], rows))
     _, rest = played(live, all_[half:])
@@ -298,7 +399,8 @@ def test_before_four_satellites_there_is_no_number(live, log):
         ({"channels": {"G": 8, "R": 0}}, "positive"),
         ({"filter": "delays+rts"}, "whole log"),
         ({"filter": "none"}, "filter"),
-        ({"wait_s": -1.0}, "negative"),
+        ({"wait_s": -1.0}, "0 to 10 s"),
+        ({"longest_delay_s": math.inf}, "0 to 10 s"),
     ],
 )
 def test_what_it_cannot_be_made_with_is_refused(given, match):

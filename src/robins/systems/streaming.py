@@ -116,6 +116,9 @@ def stamp(time_ns: Any) -> int:
     if isinstance(time_ns, bool) or not isinstance(time_ns, int | np.integer):
         what = f"a stamp must be a whole number of nanoseconds, got {time_ns!r}"
         raise LiveError(what, "time_ns", "of seconds give round(1e9 * seconds)")
+    if abs(int(time_ns)) >= 2**62:
+        what = f"{time_ns} ns is no time: it is beyond 146 years"
+        raise LiveError(what, "time_ns", "give nanoseconds since 1970, or since a start")
     return int(time_ns)
 
 

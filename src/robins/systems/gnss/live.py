@@ -24,18 +24,28 @@ from jaxtyping import ArrayLike, PyTree
 from robins.earth import Geodetic
 from robins.errors import require
 from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilter
+from robins.filters.belief import FAILURES
 from robins.filters.machine import usual
 from robins.filters.run import Step
-from robins.ins.plausible import GYRO_LIMIT
 from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
 from robins.systems.gnss.model import RANGES, LocalFrame, MotionStep
 from robins.systems.gnss.parameters import GnssReplay
 from robins.systems.gnss.path import LEAST, GnssPath
-from robins.systems.streaming import Flag, Live, LiveError, numbers, online, stamp
+from robins.systems.streaming import (
+    Flag,
+    Live,
+    LiveError,
+    TimestampGate,
+    numbers,
+    online,
+    stamp,
+)
 from robins.systems.study import Contender
 
 _FASTEST = 150.0  # m/s, of wheels
+_GAP_S, _PATIENCE = 10.0, 10  # of the odometry: longest gap, and samples after it to believe it
 _MOST_WAITING = 600  # epochs without odometry
+_LONGEST_WAIT_S = 10.0
 CHANNELS = {"G": 12, "R": 8, "E": 12}
 """Columns of each satellite system: GPS, GLONASS, Galileo."""
 
@@ -45,8 +55,8 @@ class RoadNavigation(NamedTuple):
 
     time_ns: int
     r_e: np.ndarray  # (3,) m, Earth-fixed
-    sigma_m: np.ndarray  # (3,) m, north, east, down
-    heading_rad: float  # from north to east; NaN while it is not known
+    sigma_m: np.ndarray  # (3,) m, north, east, down, at the first fix
+    heading_rad: float  # from the north of the first fix to east; NaN while unknown
     sigma_heading_rad: float
     flags: Flag
     code: Code | None = None  # of the last epoch of pseudoranges
@@ -88,9 +98,10 @@ def answer_of(time_ns: int, place: LocalFrame, x: np.ndarray, flags: Flag) -> Ro
         flags: of the answer.
     """
     c, P = x[6:8], x[8:12].reshape(2, 2)
-    length = float(np.hypot(*c))
-    across = np.array([-c[1], c[0]]) / max(length, 1e-9)
-    sigma = float(np.sqrt(across @ P @ across)) / max(length, 1e-9)
+    length, sigma = float(np.hypot(*c)), math.inf
+    if length > 1e-6 * float(np.sqrt(np.trace(P))):  # else it has no direction
+        across = np.array([-c[1], c[0]]) / length
+        sigma = float(np.sqrt(across @ P @ across)) / length
     known = sigma < np.pi / 2
     heading = math.atan2(c[1], c[0]) if known else math.nan
     r_e = np.asarray(place.origin_e) + np.asarray(place.C_en) @ x[:3]
@@ -105,14 +116,15 @@ class LiveGnss(Live):
 
     Attributes:
         counts: records refused by reason: `odometry_...`, `ranges_...` (epochs), `range_...`
-            (single pseudoranges).
+            (single pseudoranges); `epoch_...` by `Code`, epochs that the filter could not use
+            (`Flag.DOUBTFUL`); `begun_anew` after a gap of 10 s or a clock that was set.
         epoch: answer of the filter at the last epoch; None before.
         passed: answers at the epochs that the last record brought, in order.
     """
 
     _parameters = GnssReplay
     _kept: ClassVar[tuple[str, ...]] = ("_last_step", "_frame")
-    _parts: ClassVar[tuple[str, ...]] = ("_path",)
+    _parts: ClassVar[tuple[str, ...]] = ("_gate", "_path")
 
     def __init__(
         self,
@@ -120,6 +132,7 @@ class LiveGnss(Live):
         channels: Mapping[str, int] = CHANNELS,
         filter: str = "delays",
         wait_s: float = 0.0,
+        longest_delay_s: float = 1.0,
         machine: str | None = None,
     ):
         """Make the programs, before the first record.
@@ -130,11 +143,13 @@ class LiveGnss(Live):
                 the others are estimated against the first.
             filter: a causal one of the replays.
             wait_s: time that an epoch waits for earlier ones; the answers carry on meanwhile.
+            longest_delay_s: how late an epoch may come in an outage, where steps without
+                pseudoranges follow the odometry.
             machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
 
         Raises:
-            ValueError: fewer than four columns, a letter that is none, a negative wait, or no such
-                filter or machine.
+            ValueError: fewer than four columns, a letter that is none, a wait or delay below zero
+                or over 10 s, or no such filter or machine.
         """
         for letter, count in channels.items():
             require(
@@ -144,8 +159,10 @@ class LiveGnss(Live):
         total = sum(channels.values())
         require(total >= LEAST, f"channels must be {LEAST} or more in all", total)
         require(filter not in SMOOTHERS, f"{filter} smooths: it needs the whole log")
-        require(wait_s >= 0.0, "wait_s must not be negative", wait_s)
+        for what, value in {"wait_s": wait_s, "longest_delay_s": longest_delay_s}.items():
+            require(0.0 <= value <= _LONGEST_WAIT_S, f"{what} must be 0 to 10 s", value)
         made_with = {"channels": dict(channels), "filter": filter, "wait_s": wait_s}
+        made_with["longest_delay_s"] = longest_delay_s
         made_with |= {"machine": machine or usual()}
         super().__init__(parameters, **made_with)
         self.start_over()
@@ -153,10 +170,15 @@ class LiveGnss(Live):
 
     def start_over(self) -> None:
         """Be as new: without records and counts."""
+        self._gate = TimestampGate(_GAP_S, _PATIENCE)
         self.counts.clear()
-        self._path = GnssPath(
-            self.parameters, self._made_with["channels"], self._made_with["wait_s"]
-        )
+        self._restart()
+
+    def _restart(self) -> None:
+        """Forget all but the counts and the stamps."""
+        given = self._made_with
+        waits = given["wait_s"], given["longest_delay_s"]
+        self._path = GnssPath(self.parameters, given["channels"], *waits)
         self._last_step: tuple[int, np.ndarray] | None = None  # stamp and vector of the last step
         self._frame = np.zeros((4, 3))  # of the state: origin [m, ECEF], and C_en
         self._online, self.epoch = None, None
@@ -185,14 +207,16 @@ class LiveGnss(Live):
         self.passed, time = [], stamp(time_ns)
         given = [speed_mps, yaw_rate, sigma_speed, sigma_yaw]
         row = numbers("speed_mps, yaw_rate, sigma_speed, sigma_yaw", given, 4)
-        newest = self._path.newest_ns
-        why = ""
         if not np.all(np.isfinite(row)):
             why = "nan"
-        elif abs(row[0]) > _FASTEST or abs(row[1]) > GYRO_LIMIT or np.any(row[2:] <= 0.0):
+        elif abs(row[0]) > _FASTEST or np.any(row[2:] <= 0.0):
             why = "absurd"
-        elif newest is not None and time <= newest:
-            why = "duplicate" if time == newest else "backward"
+        else:
+            why = self._gate.check(time, np.array([row[1], 0.0, 0.0, 0.0, 0.0, 0.0]))
+        if why == "anew":
+            self.counts["begun_anew"] += 1
+            self._restart()
+            why = ""
         if why:
             self.counts[f"odometry_{why}"] += 1
             return self._answer(Flag.REFUSED)
@@ -218,32 +242,36 @@ class LiveGnss(Live):
             range_m: (n,) m, corrected for the atmosphere and the satellites' clocks.
             sigma_m: (n,) m.
             satellite_e: (n, 3) m, Earth-fixed at the time of transmission.
-            elevation_rad: (n,) rad, NaN where unknown.
-            cn0_dbhz: (n,) dBHz, NaN where unknown.
+            elevation_rad: (n,) rad; NaN is taken for the last one, at first for the horizon.
+            cn0_dbhz: (n,) dBHz; NaN for the last one, at first for a blocked signal.
 
         Raises:
             LiveError: a stamp, name or number of another kind, or one satellite twice; the object
                 goes on.
         """
         self.passed, time, n = [], stamp(time_ns), len(satellites)
+        names = list(satellites)
+        if not all(isinstance(name, str) and name for name in names) or len(set(names)) < n:
+            raise LiveError(f"are {names!r:.80}", "satellites", "give each by its name, once")
         columns = {"range_m": range_m, "sigma_m": sigma_m}
         columns |= {"elevation_rad": elevation_rad, "cn0_dbhz": cn0_dbhz}
         given = [numbers(name, values, n) for name, values in columns.items()]
+        if np.shape(satellite_e) != (n, 3):
+            what = f"has the shape {np.shape(satellite_e)}, not ({n}, 3)"
+            raise LiveError(what, "satellite_e", "give x, y, z of each satellite in a row")
         place = numbers("satellite_e", np.ravel(satellite_e), 3 * n).reshape(n, 3)
         rows = np.column_stack([*given[:2], place, *given[2:]])
-        names = list(satellites)
-        if len(set(names)) < n or not all(isinstance(name, str) and name for name in names):
-            raise LiveError(f"are {names!r:.80}", "satellites", "give each by its name, once")
         if why := self._refused(time):
             self.counts[f"ranges_{why}"] += 1
             return self._answer(Flag.REFUSED)
         letters = self._made_with["channels"]
         good = np.all(np.isfinite(rows[:, :5]), axis=1) & (rows[:, 1] > 0.0)
         known = np.array([name[0] in letters for name in names], dtype=bool)
-        self.counts["range_bad"] += int(np.sum(~good))
-        self.counts["range_of_another_system"] += int(np.sum(good & ~known))
+        self.counts.update(["range_bad"] * int(np.sum(~good)))
+        self.counts.update(["range_of_another_system"] * int(np.sum(good & ~known)))
         taken = np.flatnonzero(good & known)
         if not len(taken):
+            self.counts["ranges_empty"] += 1
             return self._answer(Flag.REFUSED)
         self._path.push_ranges(time, [names[k] for k in taken], rows[taken])
         self._advance()
@@ -256,6 +284,9 @@ class LiveGnss(Live):
             return "too_old"
         if time_ns in self._path.waiting_ns:
             return "duplicate"
+        newest_ns = self._path.newest_ns
+        if newest_ns is not None and time_ns > newest_ns + _GAP_S * 1e9:
+            return "ahead"
         return "without_odometry" if len(self._path.waiting_ns) >= _MOST_WAITING else ""
 
     def _advance(self) -> None:
@@ -268,10 +299,14 @@ class LiveGnss(Live):
             self._last_step = time_ns, np.asarray(found)
             self.epoch = self._epoch()
             self.passed.append(self.epoch)
-            if self.epoch.flags:
-                self.counts["outliers_pseudorange"] += 1
-        self.counts["range_without_column"] = self._path.dropped
-        self.counts = +self.counts
+            if self.epoch.flags and self.epoch.code is not None:
+                self.counts[f"epoch_{self.epoch.code.name.lower()}"] += 1
+        for name, count in (
+            ("range_without_column", self._path.dropped),
+            ("ranges_without_fix", self._path.without_fix),
+        ):
+            if count:
+                self.counts[name] = count
 
     def _begin(self, first: GnssWorld) -> None:
         """Begin the filter at the first epoch."""
@@ -298,7 +333,7 @@ class LiveGnss(Live):
         assert self._last_step is not None
         time_ns, found = self._last_step
         answer = answer_of(time_ns, self._place, found, Flag(0))
-        return answer._replace(flags=Flag.OUTLIER if answer.code == Code.REFUSED else Flag(0))
+        return answer._replace(flags=Flag.DOUBTFUL if answer.code in FAILURES else Flag(0))
 
     def _answer(self, mark: Flag) -> RoadNavigation:
         newest = self._path.newest_ns or 0
@@ -319,8 +354,8 @@ class LiveGnss(Live):
         names = [f"{letter}{k}" for k, letter in enumerate(letters)]
         known, size = np.full(len(letters), 40.0), np.full(len(letters), 2e7)
         satellite_e = 2e7 * line + np.array([6.4e6, 0.0, 0.0])
-        step_ns = max(1_000_000_000, round(1e9 * self._made_with["wait_s"]))
-        for k in range(4):
+        step_ns, waits_ns = 500_000_000, round(1e9 * self._made_with["wait_s"])
+        for k in range(6 + waits_ns // step_ns):
             time_ns = step_ns * k
             self.push_ranges(time_ns, names, size, known, satellite_e, 0.01 * known, known)
             self.push_odometry(time_ns, 0.0, 0.0, 0.1, 0.01)

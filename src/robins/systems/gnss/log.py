@@ -49,7 +49,9 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPat
     ranges, odometry = log.ranges, log.odometry
     inside = ranges.time_ns >= odometry.time_ns[0]
     inside &= ranges.time_ns <= odometry.time_ns[-1]
-    path = GnssPath(believed, channels_of(ranges, inside))
+    times, counts = np.unique(ranges.time_ns[inside], return_counts=True)
+    from_ns = min(times[counts >= LEAST], default=0)  # a satellite of before has no column
+    path = GnssPath(believed, channels_of(ranges, inside & (ranges.time_ns >= from_ns)))
     names = names_of(ranges)
     rows = np.column_stack(
         [ranges.range_m, ranges.sigma_m, ranges.satellite_e, ranges.elevation_rad, ranges.cn0_dbhz]
@@ -60,10 +62,16 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPat
             [odometry.speed_mps, odometry.yaw_rate, odometry.sigma_speed, odometry.sigma_yaw]
         ),
     )
-    edges = np.flatnonzero(np.diff(ranges.time_ns)) + 1
+    edges, steps = np.flatnonzero(np.diff(ranges.time_ns)) + 1, []
     for at in np.split(np.arange(len(names)), edges):
         path.push_ranges(int(ranges.time_ns[at[0]]), [names[k] for k in at], rows[at])
-    if not (steps := path.steps()):
+        steps += path.steps()
+    if path.without_fix and not steps:
+        raise ValueError(
+            f"no epoch of {LEAST} satellites or more gives a place on the Earth; are pseudoranges "
+            "and satellites in metres?"
+        )
+    if not steps:
         raise ValueError(
             f"no epoch has pseudoranges of {LEAST} satellites while there is odometry; are both "
             "of the same drive?"
@@ -77,7 +85,12 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPat
 def names_of(ranges: RangeTable) -> list[str]:
     """Name of the satellite of each row, such as "G5"."""
     pairs = zip(ranges.system.tolist(), ranges.satellite.tolist(), strict=True)
-    return [f"{LETTERS.get(system, 'X')}{number}" for system, number in pairs]
+    return [f"{_letter(system)}{number}" for system, number in pairs]
+
+
+def _letter(system: int) -> str:
+    """Letter of a system; a small one of its own where it has no name."""
+    return LETTERS.get(system, chr(ord("a") + system % 26))
 
 
 def channels_of(ranges: RangeTable, rows: np.ndarray) -> dict[str, int]:
@@ -86,7 +99,7 @@ def channels_of(ranges: RangeTable, rows: np.ndarray) -> dict[str, int]:
     systems, counts = np.unique(seen[0], return_counts=True)
     channels: dict[str, int] = {}
     for system, count in zip(systems.tolist(), counts.tolist(), strict=True):
-        letter = LETTERS.get(system, "X")
+        letter = _letter(system)
         channels[letter] = channels.get(letter, 0) + count
     return channels
 

@@ -3,11 +3,15 @@
 A replay is one chunk, a live object chunks of one; any chunks of the same records give the same
 bits. Each time of the receiver is an epoch, and each satellite has a column, free again when
 another one needs it. Only the latency of the odometry is taken from the future: an epoch becomes a
-step when the odometry has reached it, or has passed it by a wait that is asked for.
+step when the odometry has reached it, or has passed it by a wait that is asked for. Where no epoch
+comes, steps of one second without pseudoranges follow the odometry, `patience_s` behind it.
 """
 
 from __future__ import annotations
 
+import bisect
+import math
+from collections import Counter
 from collections.abc import Mapping
 
 import jax
@@ -27,6 +31,9 @@ from robins.systems.gnss.model import (
 from robins.systems.gnss.parameters import GnssAssumptions
 
 LEAST = 4  # satellites of the first fix
+BRIDGE_NS = 1_000_000_000  # longest step: a mean speed and turn rate must describe it
+_EARTH_M = 6.2e6, 6.6e6  # from its centre, least and most of a first fix
+_FAR_M = 2.6e7  # where a satellite is read that is not measured
 _fix = jax.jit(first_fix)
 
 
@@ -41,9 +48,16 @@ class GnssPath:
         way_m: along the road since the first epoch.
         fix: (4 + K,) of `first_fix`, of the first epoch.
         dropped: pseudoranges without a column, because all of their system were in use.
+        without_fix: epochs with satellites enough whose first fix is no place on the Earth.
     """
 
-    def __init__(self, believed: GnssAssumptions, channels: Mapping[str, int], wait_s: float = 0.0):
+    def __init__(
+        self,
+        believed: GnssAssumptions,
+        channels: Mapping[str, int],
+        wait_s: float = 0.0,
+        patience_s: float = math.inf,
+    ):
         """Make a path without records.
 
         Args:
@@ -51,20 +65,28 @@ class GnssPath:
             channels: columns of each satellite system, by the first letter of its satellites.
             wait_s: time by which the odometry must be past an epoch, for earlier epochs that come
                 later.
+            patience_s: time by which a step without an epoch follows the odometry; epochs that are
+                later than that come too late. In a log that ends with its epochs there is none.
         """
         self._believed, self._wait_ns = believed, round(1e9 * wait_s)
+        self._patience_ns, self._channels = 1e9 * max(patience_s, wait_s), dict(channels)
         self._letters = "".join(letter * count for letter, count in channels.items())
         others = np.array(list(channels)[1:], dtype=str)
         self.member = (np.array(list(self._letters))[:, None] == others[None, :]).astype(float)
-        self.satellites = [""] * len(self._letters)
-        self._used = np.full(len(self._letters), -1)  # number of the last epoch of each column
-        self._shown = np.zeros((len(self._letters), 2))  # its elevation [rad] and C/N0 [dBHz]
+        self._clear_columns()
         self._odometry_ns, self._odometry = np.zeros(0, np.int64), np.zeros((0, 4))
         self._waiting: list[tuple[int, list[str], np.ndarray]] = []
         self.begin_ns: int | None = None
         self.time_ns: int | None = None
         self.fix = np.zeros(4 + self.member.shape[1])
-        self._epochs, self.way_m, self._is_long, self.dropped = 0, 0.0, False, 0
+        self.way_m, self._is_long, self.without_fix = 0.0, False, 0
+
+    def _clear_columns(self) -> None:
+        count = len(self._letters)
+        self.satellites, self.dropped, self._epochs = [""] * count, 0, 0
+        self._used = np.full(count, -1)  # number of the last epoch of each column
+        self._shown = np.zeros((count, 2))  # its elevation [rad] and C/N0 [dBHz]
+        self._satellite_e = np.tile([_FAR_M, 0.0, 0.0], (count, 1))  # where it was last
 
     def push_odometry(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
         """Take odometry.
@@ -91,25 +113,50 @@ class GnssPath:
         if len(set(names)) < len(names):
             what = "a satellite has two pseudoranges at one time; leave one signal of each"
             raise ValueError(what)
-        self._waiting.append((time_ns, names, rows))
-        self._waiting.sort(key=lambda epoch: epoch[0])
+        bisect.insort(self._waiting, (time_ns, names, rows), key=lambda epoch: epoch[0])
 
     def steps(self) -> list[tuple[int, GnssWorld]]:
-        """Time [ns] and world, without a leading axis, of each epoch that can be a step now.
+        """Time [ns] and world, without a leading axis, of each step that can be taken now.
 
-        The first is the first epoch with four satellites while there is odometry; the step to it
+        The first is to the first epoch with a fix of four satellites while there is odometry; it
         has no length.
         """
         out: list[tuple[int, GnssWorld]] = []
-        if (newest_ns := self.newest_ns) is None:
-            return out
-        while self._waiting and self._waiting[0][0] <= newest_ns - self._wait_ns:
-            time_ns, names, rows = self._waiting.pop(0)
-            starts = len(names) >= LEAST and self._odometry_ns[0] <= time_ns
-            if self.time_ns is not None or starts:
+        while (due := self._due()) is not None:
+            time_ns, names, rows = due
+            if self.time_ns is not None or self._begins(time_ns, names, rows):
                 out.append((time_ns, self._step(time_ns, names, rows)))
             self._forget(time_ns)
+        if self.time_ns is None and self.newest_ns is not None and self._patience_ns < math.inf:
+            self._forget(self.newest_ns - round(self._patience_ns))
         return out
+
+    def _due(self) -> tuple[int, list[str], np.ndarray] | None:
+        """Next epoch, or end of a step without one; None: the odometry has not come that far."""
+        if (newest_ns := self.newest_ns) is None:
+            return None
+        first_ns = self._waiting[0][0] if self._waiting else math.inf
+        ready = first_ns <= newest_ns - self._wait_ns
+        if self.time_ns is not None:
+            edge_ns = self.time_ns + BRIDGE_NS
+            if edge_ns < first_ns and (ready or edge_ns <= newest_ns - self._patience_ns):
+                return edge_ns, [], np.zeros((0, 7))
+        return self._waiting.pop(0) if ready else None
+
+    def _begins(self, time_ns: int, names: list[str], rows: np.ndarray) -> bool:
+        """Find the first fix; False where an epoch gives none."""
+        of = Counter(name[0] for name in names)
+        able = sum(min(of[letter], count) for letter, count in self._channels.items())
+        if able < LEAST or self._odometry_ns[0] > time_ns:
+            return False
+        y, sky, _ = self._in_columns(names, rows)
+        fix = np.asarray(_fix(y, sky, self.member, self._believed.clock.system_bias))
+        self._clear_columns()
+        if not _EARTH_M[0] < float(np.linalg.norm(fix[:3])) < _EARTH_M[1]:
+            self.without_fix += 1
+            return False
+        self.fix, self.begin_ns, self.time_ns = fix, time_ns, time_ns
+        return True
 
     def since(self) -> MotionStep:
         """Step from the last epoch to the newest odometry."""
@@ -132,32 +179,33 @@ class GnssPath:
         return int(self._odometry_ns[-1]) if len(self._odometry_ns) else None
 
     def _step(self, time_ns: int, names: list[str], rows: np.ndarray) -> GnssWorld:
-        is_first = self.time_ns is None
-        if is_first:
-            self.begin_ns = self.time_ns = time_ns
         u, way_m = self._travel(time_ns)
         self.way_m += way_m
         y, sky, fresh = self._in_columns(names, rows)
-        if is_first:
-            self.fix = np.asarray(_fix(y, sky, self.member, self._believed.clock.system_bias))
         is_long = self.way_m >= self._believed.wheels.aligned_after
         length = np.array([1.0 if is_long and not self._is_long else np.nan])
         self.time_ns, self._is_long = time_ns, self._is_long or is_long
         return GnssWorld(self.fix, self._with_delays(u, fresh), {RANGES: y, LENGTH: length}, sky)
 
     def _travel(self, until_ns: int) -> tuple[MotionStep, float]:
-        """Step from the last epoch to a time, without delays, and the way [m].
+        """Step from the last one to a time, without delays, and the length of the way [m].
 
         Speed and yaw rate are straight lines between their samples; a step has their means.
         """
         assert self.time_ns is not None
-        t, dt = (self._odometry_ns - self.time_ns) * 1e-9, (until_ns - self.time_ns) * 1e-9
+        ns = self._odometry_ns
+        rows = slice(
+            max(int(np.searchsorted(ns, self.time_ns, side="right")) - 1, 0),
+            int(np.searchsorted(ns, until_ns, side="left")) + 1,
+        )
+        t, dt = (ns[rows] - self.time_ns) * 1e-9, (until_ns - self.time_ns) * 1e-9
         at = np.concatenate([[0.0], t[(t > 0.0) & (t < dt)], [dt]])
-        ways = [float(np.trapezoid(np.interp(at, t, x), at)) for x in self._odometry[:, :2].T]
-        speed, rate = (way / dt if dt > 0.0 else 0.0 for way in ways)
-        slip, sway = (float(np.interp(dt, t, x)) for x in self._odometry[:, 2:].T)
+        v, w = (np.interp(at, t, x) for x in self._odometry[rows, :2].T)
+        slip, sway = (float(np.interp(dt, t, x)) for x in self._odometry[rows, 2:].T)
+        speed, rate = (float(np.trapezoid(x, at)) / dt if dt > 0.0 else 0.0 for x in (v, w))
         none = np.zeros(0)
-        return MotionStep(dt, speed, rate, slip, sway, none, none, none), ways[0]
+        way_m = float(np.trapezoid(np.abs(v), at))
+        return MotionStep(dt, speed, rate, slip, sway, none, none, none), way_m
 
     def _with_delays(self, u: MotionStep, fresh: np.ndarray) -> MotionStep:
         mean, spread = delay_law(self._believed.delays, *self._shown.T)
@@ -167,7 +215,6 @@ class GnssPath:
         """Pseudoranges (N,), NaN where there is none, satellites, and (N,) one where new."""
         count = len(self._letters)
         y, sigma, fresh = np.full(count, np.nan), np.ones(count), np.zeros(count)
-        satellite = np.tile(rows[0, 2:5], (count, 1))  # read, and not used, where there is none
         self._epochs += 1
         for name in set(names) & set(self.satellites):  # these keep their columns
             self._used[self.satellites.index(name)] = self._epochs
@@ -179,9 +226,9 @@ class GnssPath:
             if name != self.satellites[k]:
                 self.satellites[k], self._shown[k], fresh[k] = name, 0.0, 1.0
             self._used[k] = self._epochs
-            y[k], sigma[k], satellite[k] = row[0], row[1], row[2:5]
+            y[k], sigma[k], self._satellite_e[k] = row[0], row[1], row[2:5]
             self._shown[k] = np.where(np.isfinite(row[5:]), row[5:], self._shown[k])
-        return y, Sky(satellite, sigma), fresh
+        return y, Sky(self._satellite_e.copy(), sigma), fresh
 
     def _column(self, name: str) -> int | None:
         """Column of a satellite; for a new one that which was not in use for longest."""
