@@ -6,7 +6,7 @@ block or with a fix take a step of the filter. Nothing is compiled meanwhile. Fi
 an `OnlineFilter` of fifteen states takes; then the live objects, with their filters on each
 machine, and how long they took to be made.
 
-    python benchmarks/live.py [calls] [marg] [ekf] [robust] [vm] [jax] [c]
+    python benchmarks/live.py [calls] [marg] [ekf] [robust] [ranges] [vm] [jax] [c]
 """
 
 import sys
@@ -20,6 +20,9 @@ from marg import RATE_HZ, made_log
 
 from robins import scenario
 from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman, taylor, unscented
+from robins.systems import SYSTEMS
+from robins.systems.gnss import City, GnssReplay, LiveGnss, world
+from robins.systems.gnss.model import RANGES
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, drive_dataset
 from robins.systems.ins_gnss import InsGnssReplay as Navigated
 from robins.systems.marg import LiveMarg, MargReplay
@@ -136,8 +139,30 @@ def navigation(name: str, machine: str) -> None:
     told(f"LiveInsGnss {name}, {machine}, a fix", fixes, step_s)
 
 
+def ranges(machine: str) -> None:
+    """The city: odometry and pseudoranges of 16 satellites at 5 Hz."""
+    city = scenario.parse(City, SYSTEMS["gnss"].scenarios["city"].read_text(), [])
+    course = world.lay_out(city)
+    run = world.simulate(city, course, 0, jnp.asarray(0))
+    live = made(LiveGnss, GnssReplay(), {"G": 8, "R": 8}, machine=machine)
+    y, sigma = np.asarray(run.y[RANGES]), np.asarray(run.sky.sigma)
+    cn0 = 45.0 - 40.0 * np.log10(sigma / city.satellites.noise)
+    odometry, epochs = [], []
+    for k, t in enumerate(course.epoch_s):
+        stamp, there = round(1e9 * t), np.flatnonzero(np.isfinite(y[k]))
+        row = [float(np.asarray(x)[k]) for x in run.u[1:5]]
+        odometry.append(timed(live.push_odometry, stamp, *row))
+        names = [course.satellites[n] for n in there]
+        rows = y[k, there], sigma[k, there], course.satellite_e[there]
+        shown = course.elevation_rad[there], cn0[k, there]
+        epochs.append(timed(live.push_ranges, stamp, names, *rows, *shown))
+    told(f"LiveGnss, {machine}, odometry", odometry, 1.0 / city.rate)
+    told(f"LiveGnss, {machine}, an epoch", epochs, 1.0 / city.rate)
+
+
 if __name__ == "__main__":
-    asked = [a for a in sys.argv[1:] if a not in MACHINES] or ["calls", "marg", "ekf", "robust"]
+    asked = [a for a in sys.argv[1:] if a not in MACHINES]
+    asked = asked or ["calls", "marg", "ekf", "robust", "ranges"]
     if "calls" in asked:
         calls()
     for machine in [m for m in MACHINES if m in sys.argv[1:]] or MACHINES:
@@ -146,3 +171,5 @@ if __name__ == "__main__":
         for name in ("ekf", "robust"):
             if name in asked:
                 navigation(name, machine)
+        if "ranges" in asked:
+            ranges(machine)

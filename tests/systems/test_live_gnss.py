@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from collections import OrderedDict
 from functools import partial
 
 import gnss_logs
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.filters import Belief, kalman
+from robins.filters import Belief, Code, kalman
 from robins.logs import load_ranges
 from robins.results import ResultError, ignore_progress
 from robins.systems import replaying
@@ -186,6 +187,17 @@ def test_saved_in_between_it_goes_on_to_the_bit(live, log, replayed, tmp_path):
         LiveMarg.load(tmp_path / "car.live")
 
 
+@pytest.mark.parametrize("channels", [{"G": 5, "R": 5}, {"G": 4}, {"E": 3, "G": 12}])
+def test_no_program_is_made_once_it_is_there(log, channels, monkeypatch):
+    known = OrderedDict()
+    monkeypatch.setattr("robins.program.memory._known", known)
+    live, made = LiveGnss(PARAMETERS, channels), list(known)
+    assert len(made) == 2  # a step, and a look ahead
+    _, passed = played(live, records(log))
+    assert len(passed) > 50
+    assert list(known) == made
+
+
 def test_a_satellite_takes_the_column_that_was_not_used_for_longest(log):
     _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
     letters = sorted({name[0] for name in names})
@@ -288,6 +300,41 @@ def test_through_an_outage_it_follows_the_odometry(channels, log):
     assert paths[0].way_m == pytest.approx(649.0, abs=0.5)
 
 
+def test_an_epoch_that_the_filter_cannot_use_is_doubtful(live, log):
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    absurd = rows.copy()
+    absurd[:, 0] = 1e300
+    places = []
+    for k, of in enumerate((rows, rows, absurd, rows)):
+        push(live, EPOCH, (k * 10**9, names, of))
+        places.append(live.push_odometry(k * 10**9, 0.0, 0.0, 0.1, 0.01).r_e)
+    assert np.linalg.norm(places[-1] - places[1]) < 50.0
+    time_ns, found = live._last_step
+    found = found.copy()
+    found[12] = float(Code.NOT_FINITE)
+    live._last_step = time_ns, found
+    assert live._epoch().flags == Flag.DOUBTFUL
+
+
+def test_without_odometry_the_oldest_epochs_go(live, log):
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    for k in range(620):
+        push(live, EPOCH, (k * 10**8, names, rows))
+    assert live.counts["ranges_without_odometry"] == 20
+    assert live._path.waiting_ns[0] == 20 * 10**8
+
+
+def test_what_was_lost_is_counted_over_a_new_beginning(live, log):
+    _, names, rows = next(e for e in epochs_of(log) if len(e[1]) >= 6)
+    wrong = rows / 1e3
+    push(live, EPOCH, (0, names, wrong))
+    live.push_odometry(0, 0.0, 0.0, 0.1, 0.01)
+    for k in range(10):
+        live.push_odometry(10**17 + k * 10**8, 0.0, 0.0, 0.1, 0.01)
+    push(live, EPOCH, (10**17 + 9 * 10**8, names, wrong))
+    assert live.counts["ranges_without_fix"] == 2
+
+
 def test_hours_without_an_epoch_take_no_memory(live):
     for k in range(3000):
         live.push_odometry(k * 100_000_000, 5.0, 0.0, 0.05, 0.002)
@@ -368,6 +415,9 @@ def test_bad_records_are_refused_and_counted(live, log):
         push(live, EPOCH, (t + 2, [names[0]] * len(names), rows))
     with pytest.raises(LiveError, match="by its name, once"):
         push(live, EPOCH, (t + 2, [["G"], *names[1:]], rows))
+    for strange in ("G05",):
+        with pytest.raises(LiveError, match="names such as"):
+            live.push_ranges(t + 2, strange, *rows.T[:2], rows[:, 2:5], *rows.T[5:])
     with pytest.raises(LiveError, match="satellite_e"):
         live.push_ranges(t + 2, names, *rows[:, :2].T, rows[:, 2:5].T, *rows[:, 5:].T)
     with pytest.raises(LiveError, match="is no time"):

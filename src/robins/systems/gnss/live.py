@@ -6,6 +6,8 @@ the state at the newest odometry. Its epochs are those of a replay. Differences:
 - An epoch that comes late is used at its own time, unless a later one was used before
   (`ranges_too_old`); where that happens, `wait_s` lets each epoch wait for earlier ones. One that
   is newer than the odometry waits for it.
+- In an outage the filter takes a step each second, `longest_delay_s` behind the odometry; an epoch
+  that is later than that is refused.
 - A replay has a column for each satellite of the log. Here their number is given for each system;
   a satellite that is new takes the column that has not been used for longest.
 """
@@ -59,7 +61,7 @@ class RoadNavigation(NamedTuple):
     heading_rad: float  # from the north of the first fix to east; NaN while unknown
     sigma_heading_rad: float
     flags: Flag
-    code: Code | None = None  # of the last epoch of pseudoranges
+    code: Code | None = None  # of the pseudoranges of the last step; MISSING in an outage
     nis: float = math.nan  # its normalised innovation squared
     dof: int = 0  # pseudoranges in it
 
@@ -118,8 +120,9 @@ class LiveGnss(Live):
         counts: records refused by reason: `odometry_...`, `ranges_...` (epochs), `range_...`
             (single pseudoranges); `epoch_...` by `Code`, epochs that the filter could not use
             (`Flag.DOUBTFUL`); `begun_anew` after a gap of 10 s or a clock that was set.
-        epoch: answer of the filter at the last epoch; None before.
-        passed: answers at the epochs that the last record brought, in order.
+        epoch: answer of the filter at its last step, an epoch or a second of an outage; None
+            before.
+        passed: answers at the steps that the last record brought, in order.
     """
 
     _parameters = GnssReplay
@@ -152,8 +155,9 @@ class LiveGnss(Live):
                 or over 10 s, or no such filter or machine.
         """
         for letter, count in channels.items():
+            is_letter = len(letter) == 1 and letter.isalpha()
             require(
-                len(letter) == 1 and letter.isalpha(), "channels: no letter of a system", letter
+                is_letter, "channels must be named by the letter of a system, G for GPS", letter
             )
             require(count >= 1, f"channels of {letter} must be positive", count)
         total = sum(channels.values())
@@ -249,8 +253,10 @@ class LiveGnss(Live):
             LiveError: a stamp, name or number of another kind, or one satellite twice; the object
                 goes on.
         """
-        self.passed, time, n = [], stamp(time_ns), len(satellites)
-        names = list(satellites)
+        self.passed, time = [], stamp(time_ns)
+        if isinstance(satellites, str) or not isinstance(satellites, Sequence | np.ndarray):
+            raise LiveError(f"are {satellites!r:.80}", "satellites", 'give names such as ["G05"]')
+        names, n = list(satellites), len(satellites)
         if not all(isinstance(name, str) and name for name in names) or len(set(names)) < n:
             raise LiveError(f"are {names!r:.80}", "satellites", "give each by its name, once")
         columns = {"range_m": range_m, "sigma_m": sigma_m}
@@ -273,6 +279,9 @@ class LiveGnss(Live):
         if not len(taken):
             self.counts["ranges_empty"] += 1
             return self._answer(Flag.REFUSED)
+        if len(self._path.waiting_ns) >= _MOST_WAITING:
+            self._path.drop_oldest()
+            self.counts["ranges_without_odometry"] += 1
         self._path.push_ranges(time, [names[k] for k in taken], rows[taken])
         self._advance()
         return self._answer(Flag(0))
@@ -285,12 +294,11 @@ class LiveGnss(Live):
         if time_ns in self._path.waiting_ns:
             return "duplicate"
         newest_ns = self._path.newest_ns
-        if newest_ns is not None and time_ns > newest_ns + _GAP_S * 1e9:
-            return "ahead"
-        return "without_odometry" if len(self._path.waiting_ns) >= _MOST_WAITING else ""
+        return "ahead" if newest_ns is not None and time_ns > newest_ns + _GAP_S * 1e9 else ""
 
     def _advance(self) -> None:
         """Take all steps that can be taken."""
+        dropped, without_fix = self._path.dropped, self._path.without_fix
         for time_ns, world in self._path.steps():
             if self._online is None:
                 self._begin(world)
@@ -301,12 +309,9 @@ class LiveGnss(Live):
             self.passed.append(self.epoch)
             if self.epoch.flags and self.epoch.code is not None:
                 self.counts[f"epoch_{self.epoch.code.name.lower()}"] += 1
-        for name, count in (
-            ("range_without_column", self._path.dropped),
-            ("ranges_without_fix", self._path.without_fix),
-        ):
-            if count:
-                self.counts[name] = count
+        lost = {"range_without_column": self._path.dropped - dropped}
+        lost["ranges_without_fix"] = self._path.without_fix - without_fix
+        self.counts.update({name: count for name, count in lost.items() if count})
 
     def _begin(self, first: GnssWorld) -> None:
         """Begin the filter at the first epoch."""
@@ -347,13 +352,17 @@ class LiveGnss(Live):
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
         letters = [name for name, n in self._made_with["channels"].items() for _ in range(n)]
-        up = (np.arange(len(letters)) + 0.5) / len(letters)
+        z = 1.0 - (2.0 * np.arange(len(letters)) + 1.0) / len(letters)
         turns = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(letters))
-        flat = np.sqrt(1.0 - up**2)
-        line = np.column_stack([up, flat * np.cos(turns), flat * np.sin(turns)])
+        flat = np.sqrt(1.0 - z**2)
+        # at a place none of whose directions is an axis: zeros in the numbers of a model are of
+        # another program
+        up_e = np.array([0.6, 0.2, np.sqrt(0.6)])
+        line = up_e + 0.8 * np.column_stack([flat * np.cos(turns), flat * np.sin(turns), z])
+        line /= np.linalg.norm(line, axis=1)[:, None]
         names = [f"{letter}{k}" for k, letter in enumerate(letters)]
         known, size = np.full(len(letters), 40.0), np.full(len(letters), 2e7)
-        satellite_e = 2e7 * line + np.array([6.4e6, 0.0, 0.0])
+        satellite_e = 2e7 * line + 6.37e6 * up_e
         step_ns, waits_ns = 500_000_000, round(1e9 * self._made_with["wait_s"])
         for k in range(6 + waits_ns // step_ns):
             time_ns = step_ns * k

@@ -115,6 +115,10 @@ class GnssPath:
             raise ValueError(what)
         bisect.insort(self._waiting, (time_ns, names, rows), key=lambda epoch: epoch[0])
 
+    def drop_oldest(self) -> None:
+        """Drop the oldest epoch that waits for odometry."""
+        del self._waiting[0]
+
     def steps(self) -> list[tuple[int, GnssWorld]]:
         """Time [ns] and world, without a leading axis, of each step that can be taken now.
 
