@@ -43,6 +43,7 @@ from robins.ins.frames import to_ned_frd
 from robins.rotation import from_rotvec, multiply, normalise, rotate, to_rotvec
 
 _EVEN = 2.0  # largest ratio of neighbouring intervals for a cubic
+_OTHERS = [[j for j in range(4) if j != i] for i in range(4)]  # of four samples but one
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
 
@@ -143,24 +144,24 @@ def _stencil(dt):
     The interval is the middle one of the three between them; an outer one at the table's ends.
     """
     n = len(dt)
-    first = np.clip(np.arange(n) - 1, 0, max(n - 3, 0))
-    stencil = np.minimum(first + np.arange(4)[:, None], n)
-    steps = dt[np.minimum(first + np.arange(3)[:, None], n - 1)]
+    each, at = np.arange(n), np.arange(4)[:, None]
+    first = np.minimum(np.maximum(each - 1, 0), max(n - 3, 0))
+    stencil = np.minimum(first + at, n)
+    steps = dt[np.minimum(first + at[:3], n - 1)]
     even = (n >= 3) & (steps.max(0) <= _EVEN * steps.min(0))
-    knots = np.concatenate([np.zeros((1, n)), np.cumsum(steps, 0)])
-    before = np.arange(n) - first  # which of the four is at the start of the interval
-    start = np.take_along_axis(knots, before[None], 0)[0]
-    at = np.arange(4)[:, None]
-    weights = []
-    for c in _GAUSS:
-        line = (1.0 - c) * (at == before) + c * (at == before + 1)
-        cubic = np.ones((4, n))
-        for i in range(4):
-            for j in range(4):
-                if i != j:
-                    gap = np.where(even, knots[i] - knots[j], 1.0)
-                    cubic[i] *= (start + c * dt - knots[j]) / gap
-        weights.append(np.where(even, cubic, line))
+    knots = np.zeros((4, n))
+    np.cumsum(steps, 0, out=knots[1:])
+    before = each - first  # which of the four is at the start of the interval
+    points = [knots[before, each] + c * dt for c in _GAUSS]
+    cubics = np.ones((len(points), 4, n))
+    for i, others in enumerate(_OTHERS):
+        gaps = np.where(even, knots[i] - knots[others], 1.0)
+        for cubic, point in zip(cubics, points, strict=True):
+            np.prod((point - knots[others]) / gaps, 0, out=cubic[i])
+    if even.all():
+        return stencil, list(cubics)
+    lines = [(1.0 - c) * (at == before) + c * (at == before + 1) for c in _GAUSS]
+    weights = [np.where(even, cubic, line) for cubic, line in zip(cubics, lines, strict=True)]
     return stencil, weights
 
 
