@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robins import linalg
-from robins.filters import Belief, Motion, Sensor, existence_margin, gamma_min, steady_h_infinity
+from robins.filters import Motion, Sensor, gamma_min, steady_h_infinity
 from robins.filters.analysis import anees, gramian, grand_mean_nis, whiteness, worded
 from robins.filters.synthesis import closed_form, h2_norm, hinf_norm, plant
 
@@ -18,11 +18,6 @@ van_loan, symmetric_root, cholesky = map(
 )
 eigenvalue_bounds, factor = map(inspect.unwrap, (linalg.eigenvalue_bounds, linalg.factor))
 SERIES = np.random.default_rng(3).normal(size=100)
-
-
-def margin(weight, gamma):
-    belief = Belief.of(jnp.zeros(2), EYE)
-    return inspect.unwrap(existence_margin)(belief, weight, gamma)
 
 
 def steady(gamma=10.0, H=EYE[:1], R=EYE[:1, :1]):
@@ -65,8 +60,6 @@ WRONG = {
     "direction without names": (lambda: worded(np.ones(3), "ab"), "for each of 2 names"),
     "norm of huge numbers": (lambda: hinf_norm(EYE / 2, 1e200 * EYE, EYE), "B holds 1e[+]200"),
     "H2 norm of huge numbers": (lambda: h2_norm(EYE / 2, EYE, 1e200 * EYE), "C holds 1e[+]200"),
-    "margin of gamma zero": (lambda: margin(EYE, 0.0), "gamma must be positive"),
-    "margin of another state": (lambda: margin(np.eye(3), 1.0), "weight has 3 columns, the state"),
     "no end of a search": (
         lambda: inspect.unwrap(gamma_min)(None, None, None, EYE, rtol=0.0),
         "rtol must be 1e-12",

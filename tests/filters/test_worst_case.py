@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from attitude_matching import in_unit, run_with
-from dense_h_infinity import greatest, h_infinity_filter, least_gamma
+from dense_h_infinity import h_infinity_filter, least_gamma
 from dense_kalman import SPLIT_W, random_system, simulate, split
 from interpreted import run
 
@@ -15,7 +15,6 @@ from robins.filters import Belief, Model, Motion, Sensor, checks, kalman, unscen
 from robins.filters.analysis.worst_case import (
     SensorChannel,
     error_operator,
-    existence_margin,
     gamma_min,
     spectral_norm,
     steady_h_infinity,
@@ -70,16 +69,6 @@ def test_a_kalman_filter_that_fails_is_not_searched():
     broken = Model(Motion(lambda x, u: x * jnp.nan, np.ones(4)), MODEL.sensors)
     with pytest.raises(ValueError, match="a step of the Kalman filter cannot be taken"):
         gamma_min(broken, START, Y, L)
-
-
-def test_the_margin_is_the_least_eigenvalue():
-    P, gamma = SYSTEM.P0, 3.0
-    want = np.linalg.eigvalsh(np.linalg.inv(P) - L.T @ L / gamma**2)[0]
-    assert float(existence_margin(START, L, gamma)) == pytest.approx(want, rel=1e-10)
-    assert existence_margin(START, L, np.inf) == pytest.approx(1.0 / greatest(P) ** 2, rel=1e-10)
-    # it is zero where gamma is the local bound
-    bound = greatest(L @ P @ L.T)
-    assert abs(float(existence_margin(START, L, bound))) < 1e-10
 
 
 # -------------------------------------------------------------------------------------- the gain

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.earth import Geodetic
+from robins.ins.errors import decay_rates, frame_dynamics, scale_of
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate_linear
-from robins.rotation import Rotation
+from robins.rotation import Rotation, skew
 
 # what an error of each kind amounts to: rad, m/s, m, rad/s, m/s^2, scales
 SIZE = np.repeat([1e-3, 1.0, 1.0, 1e-4, 1e-2, 1e-3, 1e-3], 3)
@@ -16,6 +17,45 @@ WEIGHT = SIZE[None] / SIZE[:, None]  # of an entry that takes one kind to anothe
 NOISE = InsNoise(*(np.full(3, a) for a in (1e-4, 1e-3, 1e-7, 1e-5, 300.0, 200.0, 1e-6, 1e-6)))
 
 linear = jax.jit(propagate_linear, static_argnums=3)
+
+
+def error_dynamics(state, f_b, omega_ib_b, noise=None):
+    """F and G of ``dx/dt = F x + G w`` at a state.
+
+    Args:
+        state: a `Nav` (n = 9) or an `InsState` (n = 15, or up to 21 with scale factors).
+        f_b: true specific force [m/s^2], that is, corrected for the state's biases and scales.
+        omega_ib_b: true angular rate [rad/s], likewise.
+        noise: an `InsNoise`, for the decay of the biases; None: they are constant.
+
+    Returns:
+        F, and G for unit white noise of each gyro and accelerometer (with the sign of a sensor
+        error), then of the drive of each bias and scale: m = 6 for a `Nav`, else n - 3.
+    """
+    C = state.q_nb.as_dcm()
+    F_nav = frame_dynamics(state).at[3:6, 0:3].set(-skew(C @ f_b))
+    zero = jnp.zeros((3, 3))
+    kinds = [("gyro", 0, omega_ib_b), ("accel", 3, f_b)]
+    into = {}  # effect of the errors of a sensor on the nine
+    for sensor, at, _ in kinds:
+        blocks = [zero, zero, zero]
+        blocks[at // 3] = -C / (1.0 + scale_of(state, sensor))[None]
+        into[sensor] = jnp.concatenate(blocks)
+    G_nav = jnp.concatenate([into["gyro"], into["accel"]], 1)
+    if not hasattr(state, "gyro_bias"):
+        return F_nav, G_nav
+    columns = [into["gyro"], into["accel"]]
+    columns += [
+        into[sensor] * value[None]
+        for sensor, _, value in kinds
+        if getattr(state, f"{sensor}_scale") is not None
+    ]
+    B = jnp.concatenate(columns, 1)
+    m = B.shape[1]
+    lower = jnp.concatenate([jnp.zeros((m, 9)), -jnp.diag(decay_rates(state, noise))], 1)
+    F = jnp.concatenate([jnp.concatenate([F_nav, B], 1), lower])
+    G = jnp.zeros((9 + m, 6 + m)).at[:9, :6].set(G_nav).at[9:, 6:].set(jnp.eye(m))
+    return F, G
 
 
 def state(seed=0, lat_deg=None, scales=True):

@@ -4,9 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ins_states import NOISE, SIZE, WEIGHT, block, gentle, linear, padded, state, violent
+from ins_states import (
+    NOISE,
+    SIZE,
+    WEIGHT,
+    block,
+    error_dynamics,
+    gentle,
+    linear,
+    padded,
+    state,
+    violent,
+)
 
-from robins.ins.errors import error_dynamics
 from robins.ins.increments import Increments
 from robins.ins.state import propagate
 from robins.manifold import local, retract

@@ -4,10 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ins_states import NOISE, SIZE, WEIGHT, block, gentle, linear, padded, state, violent
+from ins_states import (
+    NOISE,
+    SIZE,
+    WEIGHT,
+    block,
+    error_dynamics,
+    gentle,
+    linear,
+    padded,
+    state,
+    violent,
+)
 
 from robins import linalg
-from robins.ins.errors import error_dynamics
 from robins.ins.increments import Increments
 from robins.ins.mechanise import mechanise
 from robins.ins.state import InsState, propagate, propagate_linear, step

@@ -11,7 +11,7 @@ from exported import primitives
 import robins.program.primitives  # noqa: F401
 from robins import manifold
 from robins.campaign.monte_carlo import run_case
-from robins.export.field_notes import field_notes, mean_fields, tangent_axes, tangent_fields
+from robins.export.field_notes import MEAN, field_notes, tangent_axes, tangent_fields
 from robins.export.runs import entry_functions, reset_function
 from robins.filters import Belief
 from robins.program.walk import RULES
@@ -107,7 +107,7 @@ def undeclared(given):
     readings = jax.tree.map(lambda x: np.full(x.shape, 0.5, x.dtype), given.rows)
     notes = field_notes(problem, axes, given.state, readings)
     units = [axis and axis[1].partition("]")[0][1:] for axis in axes]
-    wrong = of_another_kind(mean, mean_fields(mean), notes, "state", units)
+    wrong = of_another_kind(mean, tangent_fields(mean, MEAN), notes, "state", units)
     for entry, (reading, *_) in readings.items():
         if entry != "predict":
             sensor = problem.sensors[entry.removeprefix("update_")]

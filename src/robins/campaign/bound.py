@@ -82,8 +82,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
             "true states, or something in it grows without bound and is not seen"
         )
     shown = [i for i in range(len(names)) if first["spoke"][i] and use[i]]
-    if not shown:
-        raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
+    require(shown, f"no sensor of filter '{name}' is left that measures: it has {names}")
     rows = np.eye(len(D)) if first["rows"] is None else first["rows"]
     left = _share_left(rows, L[-1], D)
     data = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)

@@ -306,12 +306,8 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
 
 def with_stack(function: Callable[[], PyTree]) -> PyTree:
     """Call a function on a stack that is large enough for lanes."""
-    before = threading.stack_size(STACK)
-    try:
-        with ThreadPoolExecutor(1) as pool:
-            return pool.submit(function).result()
-    finally:
-        threading.stack_size(before)
+    with threads(1) as pool:
+        return pool.submit(function).result()
 
 
 def first_worlds(problem: Problem, count: int) -> State:

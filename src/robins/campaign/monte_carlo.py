@@ -21,6 +21,7 @@ from jax.stages import Traced
 from jaxtyping import Array, PyTree
 
 from robins.campaign.memory import CHUNK, filled
+from robins.errors import require
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import normalised_sq
 from robins.filters.run import checked, nothing
@@ -157,8 +158,7 @@ def worlds(
     Raises:
         ValueError: runs or chunk is not positive.
     """
-    if runs < 1 or chunk < 1:
-        raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
+    require(min(runs, chunk) >= 1, f"runs and chunk must be at least 1, got {runs} and {chunk}")
     width, batch = filled(runs, chunk), batch or batch_of(problem)
     for begin in range(first, first + runs, width):
         sys.audit("robins.simulate", width)  # counted by tests

@@ -30,6 +30,7 @@ from scipy import stats
 from robins.campaign.machine import one_by_one
 from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import one_record
+from robins.errors import require
 from robins.filters import Belief
 from robins.filters.model import Data
 from robins.results import array
@@ -83,8 +84,7 @@ def between(low: Any, high: Any) -> ParameterRange:
         ValueError: nothing differs, or something that is not a number.
     """
     found = list(_differing(low, high, ()))
-    if not found:
-        raise ValueError("its two ends are the same")
+    require(found, "its two ends are the same")
     return ParameterRange(*(tuple(one) for one in zip(*found, strict=True)))
 
 

@@ -76,15 +76,13 @@ def unpack(content: bytes, into: Statistics, example: PyTree = None) -> dict[str
         if not isinstance(header.get(name), int):
             raise DamagedShardError(f"it does not state {name!r}")
         setattr(into, name, header[name])
-    leaves = []
+    leaves, tables = [], {"sum": into.sums, "bins": into.bins}
     for name in sorted(arrays):
         kind, _, what = name.partition(" ")
-        if kind == "sum":
-            into.sums[what] = arrays[name]
+        if kind in tables:
+            tables[kind][what] = arrays[name]
         elif kind == "each":
             into.each[what] = [arrays[name]]
-        elif kind == "bins":
-            into.bins[what] = arrays[name]
         else:
             leaves.append(arrays[name])
     if leaves and example is not None:

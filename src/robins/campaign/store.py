@@ -17,6 +17,7 @@ from time import time
 
 from robins.errors import RobinsError
 from robins.foreign import decoding
+from robins.results.folder import sync
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
 _NO_FOLDER = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}  # of the name given
@@ -59,7 +60,7 @@ class FolderStore:
                     file.flush()
                     os.fsync(file.fileno())
                 placed = _replace(partial, target) if overwrite else _link(partial, target)
-                _sync(target.parent)
+                sync(target.parent)
             finally:
                 partial.unlink(missing_ok=True)
         except OSError as error:
@@ -126,14 +127,6 @@ def _link(partial: Path, target: Path) -> bool:
 def _replace(partial: Path, target: Path) -> bool:
     os.replace(partial, target)
     return True
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class ObjectStore:

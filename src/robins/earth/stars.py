@@ -151,6 +151,16 @@ class StarIndex(NamedTuple):
     reach_rad: Any  # () each list is complete to this angle from any direction in its cell
 
 
+def refuse_other_lengths(unit_i: np.ndarray) -> None:
+    """Refuse directions (N, 3) that are no unit vectors.
+
+    Raises:
+        ValueError: a length differs from one.
+    """
+    for k in np.flatnonzero(~(np.abs(np.linalg.norm(unit_i, axis=1) - 1.0) < 1e-9)):
+        raise ValueError(f"unit_i[{k}] is {unit_i[k]}: directions must be unit vectors")
+
+
 def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
     """Sort a catalogue into cells.
 
@@ -167,9 +177,7 @@ def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
     unit = np.asarray(stars.unit_i, float)
     if unit.ndim != 2 or unit.shape[1] != 3 or not len(unit):
         raise ValueError(f"unit_i must have shape (N, 3), N at least one, got {unit.shape}")
-    off = np.flatnonzero(~(np.abs(np.linalg.norm(unit, axis=1) - 1.0) < 1e-9))
-    if off.size:
-        raise ValueError(f"unit_i[{off[0]}] is {unit[off[0]]}: directions must be unit vectors")
+    refuse_other_lengths(unit)
     order = np.argsort(stars.magnitude, kind="stable")
     unit = unit[order]
 

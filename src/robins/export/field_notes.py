@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any
 
 import jax
 import numpy as np
 from jax.tree_util import KeyPath
+from jax.typing import ArrayLike
 
 from robins import manifold
 from robins.export.library import identifier, symbol
+from robins.export.runs import Arguments
 from robins.filters import Belief
 from robins.manifold import State
 from robins.systems.study import Problem, SensorAxes
@@ -20,7 +21,7 @@ MEAN = ".belief.mean"  # of a state
 Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
-def tangent_axes(problem: Problem, reported: Any, n: int) -> list[Axis | None]:
+def tangent_axes(problem: Problem, reported: ArrayLike | None, n: int) -> list[Axis | None]:
     """Axes of the n components of the error; None for those not reported by themselves.
 
     Where the reported axes turn with time, a component must be reported so at all epochs.
@@ -66,7 +67,7 @@ def field_notes(
     problem: Problem,
     axes: list[Axis | None],
     state: State,
-    given: Mapping[str, Any],
+    given: Arguments,
     suspects: Sequence[str] = (),
 ) -> dict[tuple[str, str], str]:
     """Units and axes by struct and field: of the means in a state, of readings and innovations.
@@ -126,11 +127,6 @@ def _joined_note(own: str | None, unit_text: str) -> str:
 
 
 Place = tuple[str, int, int, str | None]
-
-
-def mean_fields(mean: State) -> Iterator[Place]:
-    """`tangent_fields` of a mean in a belief."""
-    return tangent_fields(mean, MEAN)
 
 
 def tangent_fields(tree: State, root: str) -> Iterator[Place]:

@@ -7,22 +7,24 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from robins import __version__
 from robins.campaign.monte_carlo import reported_rows
-from robins.export.field_notes import components, field_notes, mean_fields, tangent_axes
+from robins.export.field_notes import MEAN, components, field_notes, tangent_axes, tangent_fields
 from robins.export.harness import Key, RecordedSteps, check_c, makefile, recorded_h
 from robins.export.library import EntryPoint, Library, symbol
 from robins.export.page import page
 from robins.export.runs import (
     BoardRun,
     Calls,
+    EntryFunction,
     board_runs,
     by_jax,
     ends,
@@ -33,6 +35,7 @@ from robins.export.single_precision import PrecisionCost, cost, differences, in_
 from robins.filters import FilterState
 from robins.filters.composite.adjustable import adjustable
 from robins.filters.model import Data
+from robins.filters.trees import row_of
 from robins.program import SINGLE, Precision, Program, trace_steps
 from robins.systems.study import Case, Problem
 
@@ -150,18 +153,18 @@ def _entry(name: str, program: Program) -> EntryPoint:
     return EntryPoint(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
-def _any_start(runs: Sequence[BoardRun]) -> Any:
+def _any_start(runs: Sequence[BoardRun]) -> FilterState:
     """A state that is zero only where the starts of all runs are."""
 
-    def either(first: Any, *others: Any) -> Any:
-        for other in others:
-            first = np.where(np.asarray(first) == 0, other, first)
-        return first
+    def either(first: FilterState, other: FilterState) -> FilterState:
+        return jax.tree_util.tree_map(lambda a, b: np.where(np.asarray(a) == 0, b, a), first, other)
 
-    return jax.tree_util.tree_map(either, *(run.start for run in runs))
+    return reduce(either, (run.start for run in runs))
 
 
-def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> RecordedSteps:
+def _record(
+    run: BoardRun, functions: Mapping[str, EntryFunction], anew: EntryFunction
+) -> RecordedSteps:
     """Record the steps by JAX, and then a reset to the belief after the first step."""
     made = by_jax(functions, run, dict)
     states = list(made.values())[-1][0]
@@ -183,7 +186,7 @@ def _sizes(made: Calls) -> dict[Key, float]:
     for entry, (state, answer) in made.items():
         factor, mean = state.belief.factor, state.belief.mean
         sigma = np.sqrt(np.sum(np.square(factor), axis=-1))
-        for name, first, end, own in mean_fields(jax.tree_util.tree_map(lambda a: a[0], mean)):
+        for name, first, end, own in tangent_fields(row_of(mean, 0), MEAN):
             if not own:
                 key = "state", name
                 sizes[key] = max(sizes.get(key, 0.0), _largest(sigma[:, first:end]))

@@ -236,13 +236,13 @@ class Library(NamedTuple):
         sizes = zip(lengths(program.inputs), lengths(program.results), strict=True)
         reals, others = (max(pair) for pair in sizes)
         lines += [f"    real x[{reals}];", f"    whole k[{others}];"]
-        lines += _copied(self.state, "state", "x", "k", inwards=True)
+        lines += _copied(self.state, "state", inwards=True)
         for j, name in enumerate(entry.takes):
-            lines += _copied(fields_of(program.inputs, j + 1), name, "x", "k", inwards=True)
+            lines += _copied(fields_of(program.inputs, j + 1), name, inwards=True)
         lines.append(f"    of_{entry.symbol}(x, k, x, k);")
-        lines += _copied(fields_of(program.results, 0), "state", "x", "k", inwards=False)
+        lines += _copied(fields_of(program.results, 0), "state", inwards=False)
         result = self.result(entry)
-        lines += _copied(result, "result", "x", "k", inwards=False)
+        lines += _copied(result, "result", inwards=False)
         code = next(f for f in result if f.name == CODE)
         return [*lines, f"    return (int)k[{code.at}];", "}", ""]
 
@@ -272,19 +272,17 @@ def _text(lines: Sequence[str]) -> str:
     return "\n".join(part for one in split for part in wrapped(one))
 
 
-def _copied(
-    fields: Sequence[StructField], struct: str, reals: str, others: str, inwards: bool
-) -> list[str]:
-    """Lines of C that copy between a struct and the arrays of a program."""
+def _copied(fields: Sequence[StructField], struct: str, inwards: bool) -> list[str]:
+    """Lines of C that copy between a struct and the arrays x and k of a program."""
     lines = []
     for f in fields:
         if f.is_real:
-            there, size = f"{reals} + {f.at}", f"{f.size} * sizeof(real)"
+            there, size = f"x + {f.at}", f"{f.size} * sizeof(real)"
             to, source = (there, f.first(struct)) if inwards else (f.first(struct), there)
             lines.append(f"    memcpy({to}, {source}, {size});")
             continue
         here = f"({f.first(struct)})[i]" if f.leaf.shape else f"{struct}->{f.name}"
-        there = f"{others}[{f.at} + i]" if f.leaf.shape else f"{others}[{f.at}]"
+        there = f"k[{f.at} + i]" if f.leaf.shape else f"k[{f.at}]"
         kind = C_TYPES[f.leaf.kind]
         move = f"{there} = (whole){here};" if inwards else f"{here} = ({kind}){there};"
         loop = f"for (int i = 0; i < {f.size}; ++i) {{ {move} }}" if f.leaf.shape else move

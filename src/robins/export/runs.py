@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,9 @@ from jaxtyping import Array
 
 from robins.campaign.machine import first_worlds
 from robins.campaign.monte_carlo import complete_case
-from robins.filters import Belief, Code, Filter, Model, StepInfo
+from robins.filters import Belief, Code, Filter, FilterState, Model, StepInfo
 from robins.filters.kalman import WRONG
+from robins.filters.model import Data
 from robins.filters.trees import select
 from robins.manifold import State
 from robins.systems.study import Case, Problem
@@ -38,6 +39,10 @@ class UpdateResult(NamedTuple):
     wrong: Array | tuple[()] = ()  # of a bank, the probability that each suspect is wrong
 
 
+Arguments = dict[str, tuple[Data, ...]]  # of each entry point, after the state
+EntryFunction = Callable[..., tuple[FilterState, PredictionResult | UpdateResult]]
+
+
 class BoardRun(NamedTuple):
     """A simulated run, as a board is given it.
 
@@ -49,8 +54,8 @@ class BoardRun(NamedTuple):
     """
 
     case: Case
-    start: Any
-    given: dict[str, tuple[Any, ...]]
+    start: FilterState
+    given: Arguments
 
     @property
     def steps(self) -> int:
@@ -62,7 +67,7 @@ class BoardRun(NamedTuple):
         given = jax.tree_util.tree_map(lambda a: a[:steps], self.given)
         return self._replace(given=given)
 
-    def row(self, k: int) -> dict[str, tuple[Any, ...]]:
+    def row(self, k: int) -> Arguments:
         """Inputs of one step."""
         return jax.tree_util.tree_map(lambda a: a[k], self.given)
 
@@ -82,9 +87,9 @@ def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
     return found
 
 
-def _given(case: Case, model: Model) -> dict[str, tuple[Any, ...]]:
+def _given(case: Case, model: Model) -> Arguments:
     arrays = partial(jax.tree_util.tree_map, np.asarray)
-    given: dict[str, tuple[Any, ...]] = {"predict": (arrays(case.u),)}
+    given: Arguments = {"predict": (arrays(case.u),)}
     for sensor in model.sensors:
         if sensor.name in case.y:
             row = arrays(case.y[sensor.name]), arrays(case.aux.get(sensor.name))
@@ -92,17 +97,19 @@ def _given(case: Case, model: Model) -> dict[str, tuple[Any, ...]]:
     return given
 
 
-def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> dict[str, Any]:
+def entry_functions(
+    filter_: Filter, model: Model, names: Collection[str]
+) -> dict[str, EntryFunction]:
     """The entry points as functions of JAX, ``(state, *args) -> (state, result)``."""
 
-    def predict(state: Any, u: Any):
+    def predict(state: FilterState, u: Data):
         state, prediction = filter_.predict(state, model.motion, u)
         return state, PredictionResult(prediction.code)
 
-    def update(name: str) -> Any:
+    def update(name: str) -> EntryFunction:
         sensor = model.sensor(name)
 
-        def use(state: Any, y: Any, aux: Any):
+        def use(state: FilterState, y: Data, aux: Data):
             state, info = filter_.update(state, sensor, y, aux)
             return state, _update_result(info)
 
@@ -118,7 +125,7 @@ def _update_result(info: StepInfo) -> UpdateResult:
     )
 
 
-def reset_function(filter_: Filter, start: Any) -> Any:
+def reset_function(filter_: Filter, start: FilterState) -> EntryFunction:
     """The entry point `reset`, ``(state, belief) -> (state, result)``.
 
     `Filter.reset` begins from the initial state, so that nothing learned since is left, not even of
@@ -126,7 +133,7 @@ def reset_function(filter_: Filter, start: Any) -> Any:
     belief that is not finite is refused.
     """
 
-    def begin_anew(state: Any, belief: Belief):
+    def begin_anew(state: FilterState, belief: Belief):
         given = belief._replace(factor=jnp.tril(belief.factor))
         whole = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(given)])
         taken = jnp.all(whole)
@@ -145,7 +152,9 @@ def ends(calls: Calls) -> tuple[State, Array]:
     return list(calls.values())[-1][0], jnp.stack([result.code for _, result in calls.values()], -1)
 
 
-def by_jax(functions: Mapping[str, Any], run: BoardRun, kept: Callable[[Calls], Kept]) -> Kept:
+def by_jax(
+    functions: Mapping[str, EntryFunction], run: BoardRun, kept: Callable[[Calls], Kept]
+) -> Kept:
     """Kept values of the calls of each step, with a leading axis of steps; NumPy."""
 
     def step(state: State, row: State):

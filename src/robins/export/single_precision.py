@@ -15,14 +15,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array
+from numpy.typing import ArrayLike, DTypeLike
 
 from robins import units
 from robins.campaign.monte_carlo import Blocks, blocks_of, reported_rows
 from robins.export.library import Library, StructField
 from robins.export.runs import BoardRun, Calls, Kept
-from robins.filters import Belief
+from robins.filters import Belief, FilterState
 from robins.filters.analysis.consistency import normalised_sq
-from robins.manifold import local
+from robins.manifold import State, local
 from robins.program import FLAGS, Program, build
 from robins.program.walk import counts, slots
 from robins.systems.study import Contender, Problem
@@ -185,7 +186,7 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> Calls:
     return {entry.name: _as_tree(kept, entry.program) for entry, *_, kept in calls}
 
 
-def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
+def _flat(leaves: Sequence[ArrayLike], dtype: DTypeLike, steps: int) -> list[np.ndarray]:
     """Two arrays with a leading axis of steps: the reals of all leaves, and all else."""
     arrays = [np.asarray(x) for x in leaves]
     parts = []
@@ -197,7 +198,7 @@ def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
     return parts
 
 
-def _as_tree(kept: Sequence[np.ndarray], program: Program) -> Any:
+def _as_tree(kept: Sequence[np.ndarray], program: Program) -> tuple[State, State]:
     """Results of all calls of a program as it gives them, in doubles."""
     found = []
     for slot in slots(program.results)[0]:
@@ -206,11 +207,11 @@ def _as_tree(kept: Sequence[np.ndarray], program: Program) -> Any:
     return jax.tree_util.tree_unflatten(program.structure[1], found)
 
 
-Made = tuple[Any, np.ndarray | Array]  # states and codes of a run
+Made = tuple[FilterState, np.ndarray | Array]  # states and codes of a run
 
 
 def differences(
-    fields: Sequence[StructField], doubles: Any, singles: Any, least: Mapping[str, float] = NONE
+    fields: Sequence[StructField], doubles: State, singles: State, least: Mapping[str, float] = NONE
 ) -> dict[str, float]:
     """Largest relative difference of each field of reals in the states or results of a run.
 
@@ -273,7 +274,7 @@ def cost(
 
 
 def _errors(
-    problem: Problem, contender: Contender, run: BoardRun, states: Any
+    problem: Problem, contender: Contender, run: BoardRun, states: FilterState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """(E, r) reported error over the steps that count, and of each block its (E,) NEES."""
     rows, along = reported_rows(contender.reported, run.case)
@@ -283,10 +284,10 @@ def _errors(
 
 
 @partial(jax.jit, static_argnames=("blocks", "along"))
-def _judged(blocks: Blocks, along: int | None, belief: Belief, truth: Any, rows: Any):
+def _judged(blocks: Blocks, along: int | None, belief: Belief, truth: State, rows: Array | None):
     """Error and NEES by block, with a leading axis of steps."""
 
-    def one(belief: Belief, truth: Any, rows: Any):
+    def one(belief: Belief, truth: State, rows: Array | None):
         error, factor = local(belief.mean, truth), belief.factor
         error, factor = (error, factor) if rows is None else (rows @ error, rows @ factor)
         return error, {n: normalised_sq(error[a:b], factor[a:b]) for n, a, b in blocks}

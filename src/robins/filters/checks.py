@@ -36,7 +36,7 @@ def sensor_names(what: str, given: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def matrix(
-    what: str, given: object, rows: int | None = None, columns: int | None = None
+    what: str, given: Matrix, rows: int | None = None, columns: int | None = None
 ) -> np.ndarray:
     """Matrix of finite floats; refuse a shape other than (rows, columns), where these are given.
 
@@ -61,13 +61,13 @@ def matrix(
     return numbers
 
 
-def square(what: str, given: object) -> np.ndarray:
+def square(what: str, given: Matrix) -> np.ndarray:
     """Square matrix of finite floats; errors as of `matrix`."""
     numbers = matrix(what, given)
     return matrix(what, numbers, *2 * numbers.shape[:1])
 
 
-def positive(what: str, given: object, of_infinity: str) -> None:
+def positive(what: str, given: Matrix, of_infinity: str) -> None:
     """Require a positive number; infinity is allowed.
 
     Raises:
@@ -80,7 +80,7 @@ def positive(what: str, given: object, of_infinity: str) -> None:
     require(number > 0.0, f"{what} must be positive, or inf for {of_infinity}; got {given}")
 
 
-def finite_numbers(what: str, given: object) -> np.ndarray:
+def finite_numbers(what: str, given: Matrix) -> np.ndarray:
     """Array of floats from real and finite numbers.
 
     Raises:

@@ -96,7 +96,7 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
     require(iterations >= 1, "iterated: iterations must be at least 1", iterations)
     way = taylor() if linearise is None else linearise
     require(
-        way.reuse is None,
+        way.redraw,
         "iterated: points that were predicted cannot be drawn about another mean; "
         "use unscented(redraw=True)",
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -151,17 +151,21 @@ class Composite(Filter):
     """Filter made of filters; `report` asks each of them separately.
 
     Attributes:
+        held: names of the fields that are filters.
         filters: the filters it is made of.
         with_filters: ``filters -> Filter``, the same composite of other filters.
         parts: ``state -> states`` of these filters.
     """
 
+    held: ClassVar[tuple[str, ...]]
+
     @property
     def filters(self) -> tuple[Filter, ...]:
-        raise NotImplementedError(f"{type(self).__name__} must have `filters`")
+        return tuple(getattr(self, name) for name in self.held)
 
     def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
-        raise NotImplementedError(f"{type(self).__name__} must have `with_filters`")
+        new = dict(zip(self.held, filters, strict=True))
+        return dataclasses.replace(self, **new)  # type: ignore[type-var]
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
         raise NotImplementedError(f"{type(self).__name__} must have `parts`")
@@ -190,12 +194,7 @@ class Around(Composite):
 
     inner: Filter
 
-    @property
-    def filters(self) -> tuple[Filter, ...]:
-        return (self.inner,)
-
-    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
-        return dataclasses.replace(self, inner=filters[0])  # type: ignore[type-var]
+    held = ("inner",)
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
         return (state,)
@@ -297,7 +296,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     return posterior, info.contradicted_where(wrong)
 
 
-def _failure(inputs: Any, factor: Array) -> Array:
+def _failure(inputs: Data, factor: Array) -> Array:
     """Code of a failed step: INDEFINITE if finite inputs gave a factor that is not finite."""
     indefinite = finite(inputs) & ~finite(factor)
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))

@@ -58,13 +58,6 @@ class Points(NamedTuple):
     noise: Array  # (n, n) factor
 
 
-class Reuse(NamedTuple):
-    """Update with the points of the prediction."""
-
-    draw: Callable[[Belief], Points]
-    observation: Callable[[Points, Belief, Sensor, Data, Data], Observation]
-
-
 Regressed = tuple[State, Array, Array, Array | None]  # mean, spread, excess, deficit
 
 
@@ -74,12 +67,12 @@ class Linearisation:
     Attributes:
         transition: ``(belief, motion, u) -> Transition``, a prediction.
         observation: ``(prior, sensor, y, aux) -> Observation``, a measurement relative to a belief.
-        reuse: update with the points of the prediction; None if each update draws its own.
+        redraw: true if each update draws points of its own, if it uses any.
+        drawn: ``belief -> points`` for an update that draws none.
+        first_observation: ``(points, prior, sensor, y, aux) -> Observation`` by these.
     """
 
-    @property
-    def reuse(self) -> Reuse | None:
-        return None
+    redraw: bool = True
 
     def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         raise NotImplementedError(f"{type(self).__name__} has no method `transition`")
@@ -88,14 +81,12 @@ class Linearisation:
         raise NotImplementedError(f"{type(self).__name__} has no method `observation`")
 
     def drawn(self, belief: Belief) -> Data:
-        return () if self.reuse is None else self.reuse.draw(belief)
+        return ()
 
     def first_observation(
         self, points: Data, prior: Belief, sensor: Sensor, y: Data, aux: Data
     ) -> Observation:
-        if self.reuse is None:
-            return self.observation(prior, sensor, y, aux)
-        return self.reuse.observation(points, prior, sensor, y, aux)
+        return self.observation(prior, sensor, y, aux)
 
 
 def _form(x: State) -> Hashable:
@@ -265,10 +256,6 @@ class Unscented(Linearisation):
     numbers: tuple[float, float, float] = kind()
     redraw: bool = kind()
 
-    @property
-    def reuse(self) -> Reuse | None:
-        return None if self.redraw else Reuse(self.draw, self.observe_again)
-
     def reach(self, n: int) -> float:
         """Distance c of the points, in columns of the factor."""
         return sigma_weights(n, *self.numbers).reach
@@ -290,13 +277,17 @@ class Unscented(Linearisation):
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / reach
         return _observe(sensor, prior, y, aux, reading, size)
 
-    def draw(self, belief: Belief) -> Points:
+    def drawn(self, belief: Belief) -> Data:
+        if self.redraw:
+            return ()
         n = belief.factor.shape[0]
         return Points(sigma_points(belief, self.reach(n)), jnp.zeros((n, n)))
 
-    def observe_again(
-        self, points: Points, prior: Belief, sensor: Sensor, y: Data, aux: Data
+    def first_observation(
+        self, points: Data, prior: Belief, sensor: Sensor, y: Data, aux: Data
     ) -> Observation:
+        if self.redraw:
+            return self.observation(prior, sensor, y, aux)
         n = prior.factor.shape[0]
         values = each_row(lambda x: sensor.reading(x, aux), points.states)
         _, *state, lack = _regress(points.states, n, *self.numbers)

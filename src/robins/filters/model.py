@@ -19,11 +19,10 @@ from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
-from robins.filters.values import kind, value
+from robins.filters.values import Data, kind, value
 from robins.manifold import State
 
 T = TypeVar("T")
-Data = Any  # a pytree of arrays, such as a measurement or an input
 Given = ArrayLike | Sequence[Any]  # numbers from a user, or lists of them
 _LARGEST = float(np.sqrt(np.finfo(float).max))  # largest standard deviation: its square is finite
 

@@ -19,6 +19,7 @@ from robins.errors import require
 from robins.filters.checks import finite_numbers
 
 T = TypeVar("T")
+Data = Any  # a pytree of arrays, such as a measurement or an input
 Fields = tuple[tuple[str, ...], tuple[tuple[str, Hashable], ...]]  # names of data; kinds
 if TYPE_CHECKING:  # stubs lack operators between a scalar of NumPy and an array of JAX
     Numbers = jax.Array | Any
@@ -31,7 +32,7 @@ def kind(**how: Any) -> Any:
     return dataclasses.field(metadata={"kind": True}, **how)
 
 
-def is_kind(x: object) -> bool:
+def is_kind(x: Data) -> bool:
     """True if x is a name or a plain function, not a `Partial` or a callable pytree."""
     return isinstance(x, str) or (callable(x) and jax.tree_util.all_leaves([x]))
 
@@ -60,7 +61,7 @@ def value(cls: type[T]) -> type[T]:
         children, aux = flatten(x)
         return [(GetAttrKey(n), v) for n, v in zip(aux[0], children, strict=True)], aux
 
-    def unflatten(aux: Fields, children: Iterable[Any]) -> T:
+    def unflatten(aux: Fields, children: Iterable[Data]) -> T:
         data, fixed = aux
         x = object.__new__(cls)
         for n, v in (*fixed, *zip(data, children, strict=True)):
@@ -71,7 +72,7 @@ def value(cls: type[T]) -> type[T]:
     return cls
 
 
-def is_known(x: object) -> bool:
+def is_known(x: Data) -> bool:
     """True if x holds no tracer of a JAX transformation."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(x))
 
@@ -92,7 +93,7 @@ def is_factor(x: Numbers) -> Numbers:
 
 
 def number(
-    what: str, given: object, holds: Callable[[Numbers], Numbers | bool] | None = None
+    what: str, given: Data, holds: Callable[[Numbers], Numbers | bool] | None = None
 ) -> Numbers:
     """Number as a leaf: float64, without the weak type of a Python number; tracers pass.
 
@@ -109,7 +110,7 @@ def number(
     return given.astype(float) if isinstance(given, jax.Array) else np.asarray(given, float)
 
 
-def finite_leaf(what: str, given: object) -> Numbers:
+def finite_leaf(what: str, given: Data) -> Numbers:
     """Finite numbers as a leaf, checked where they are known (`finite_numbers`)."""
     return finite_numbers(what, given) if is_known(given) else jax.numpy.asarray(given)
 
@@ -124,13 +125,13 @@ def on_device(tree: T) -> T:
     return jax.tree_util.tree_map(jax.numpy.asarray, tree)
 
 
-def content(*trees: object) -> Hashable:
+def content(*trees: Data) -> Hashable:
     """Key that values with equal kinds and numbers share, for programs that fold numbers.
 
     Functions are compared by identity.
     """
 
-    def raw(x: Any) -> np.ndarray:
+    def raw(x: Data) -> np.ndarray:
         is_key = jax.numpy.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
         return np.asarray(jax.random.key_data(x) if is_key else x)
 

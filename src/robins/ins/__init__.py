@@ -22,7 +22,6 @@ from robins.ins.alignment import (
     is_static,
     level,
 )
-from robins.ins.errors import error_dynamics
 from robins.ins.extended_pose import ExtendedPose
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
@@ -52,7 +51,6 @@ __all__ = [
     "align",
     "as_trajectory",
     "direction_sensor",
-    "error_dynamics",
     "from_imu",
     "grade",
     "gyrocompass",

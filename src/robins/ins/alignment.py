@@ -347,8 +347,7 @@ def align(
         "largest_g_error": max(0.3, 5.0 * np.max(sigma_f)),
     }
     check = is_static(omega, f, **(limits | thresholds))
-    if not check.static:
-        raise ValueError(f"not at rest: {'; '.join(check.reasons)}")
+    require(check.static, f"not at rest: {'; '.join(check.reasons)}")
     if np.max(sigma_omega) <= _LARGEST_HEADING_SIGMA_RAD * OMEGA_E * np.cos(lat_rad):
         return gyrocompass(check.omega_ib_b, check.f_b, lat_rad, sigma_omega, sigma_f, alt_m)
     return level(check.f_b, sigma_f)

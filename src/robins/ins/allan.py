@@ -129,8 +129,7 @@ def deviation(
     """
     x = np.asarray(rate, float)
     x = x[:, None] if x.ndim == 1 else x
-    if x.ndim != 2:
-        raise ValueError(f"rate must have shape (N,) or (N, axes), got {np.shape(rate)}")
+    require(x.ndim == 2, f"rate must have shape (N,) or (N, axes), got {np.shape(rate)}")
     n = len(x)
     if n < 2 * _FEWEST_CLUSTERS:
         raise ValueError(

@@ -15,8 +15,6 @@ full gradient of gravity.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -24,51 +22,11 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth import A_M, E2, OMEGA_E
 from robins.ins.zonal_gravity import gravity_nd
+from robins.manifold import State
 from robins.rotation import skew
 
 
-def error_dynamics(
-    state: Any, f_b: Float[Array, "3"], omega_ib_b: Float[Array, "3"], noise: Any = None
-) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
-    """F and G at a state.
-
-    Args:
-        state: a `Nav` (n = 9) or an `InsState` (n = 15, or up to 21 with scale factors).
-        f_b: true specific force [m/s^2], that is, corrected for the state's biases and scales.
-        omega_ib_b: true angular rate [rad/s], likewise.
-        noise: an `InsNoise`, for the decay of the biases; None: they are constant.
-
-    Returns:
-        F, and G for unit white noise of each gyro and accelerometer (with the sign of a sensor
-        error), then of the drive of each bias and scale: m = 6 for a `Nav`, else n - 3.
-    """
-    C = state.q_nb.as_dcm()
-    F_nav = frame_dynamics(state).at[3:6, 0:3].set(-skew(C @ f_b))
-    zero = jnp.zeros((3, 3))
-    kinds = [("gyro", 0, omega_ib_b), ("accel", 3, f_b)]
-    into = {}  # effect of the errors of a sensor on the nine
-    for sensor, at, _ in kinds:
-        blocks = [zero, zero, zero]
-        blocks[at // 3] = -C / (1.0 + scale_of(state, sensor))[None]
-        into[sensor] = jnp.concatenate(blocks)
-    G_nav = jnp.concatenate([into["gyro"], into["accel"]], 1)
-    if not hasattr(state, "gyro_bias"):
-        return F_nav, G_nav
-    columns = [into["gyro"], into["accel"]]
-    columns += [
-        into[sensor] * value[None]
-        for sensor, _, value in kinds
-        if getattr(state, f"{sensor}_scale") is not None
-    ]
-    B = jnp.concatenate(columns, 1)
-    m = B.shape[1]
-    lower = jnp.concatenate([jnp.zeros((m, 9)), -jnp.diag(decay_rates(state, noise))], 1)
-    F = jnp.concatenate([jnp.concatenate([F_nav, B], 1), lower])
-    G = jnp.zeros((9 + m, 6 + m)).at[:9, :6].set(G_nav).at[9:, 6:].set(jnp.eye(m))
-    return F, G
-
-
-def frame_dynamics(state: Any) -> Float[Array, "9 9"]:
+def frame_dynamics(state: State) -> Float[Array, "9 9"]:
     """F of attitude, velocity and position in free fall: the part that needs no sensor data."""
     v, lat, alt = state.v_n, state.position.lat, state.position.alt
     s, c = jnp.sin(lat), jnp.cos(lat)
@@ -125,13 +83,13 @@ def frame_dynamics(state: Any) -> Float[Array, "9 9"]:
     return jnp.concatenate([jnp.concatenate(row, 1) for row in rows])
 
 
-def scale_of(state: Any, sensor: str) -> Any:
+def scale_of(state: State, sensor: str) -> Float[Array, "3"]:
     """Scale factor errors of a sensor; zero if they are not states."""
     scale = getattr(state, f"{sensor}_scale", None)
     return jnp.zeros(3) if scale is None else scale
 
 
-def decay_rates(state: Any, noise: Any) -> Float[Array, "m"]:
+def decay_rates(state: State, noise: State) -> Float[Array, "m"]:
     """Inverse time constants [1/s] of the bias and scale states, in tangent order."""
     if noise is None:
         rates = [jnp.zeros(3), jnp.zeros(3)]

@@ -15,14 +15,13 @@ obeys a linear law independent of the trajectory, however large the error (`ins.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.values import kind, value
 from robins.rotation import Rotation, skew, turn_coefficients
 
 Side = Literal["right", "left"]
@@ -34,8 +33,7 @@ def _turn(phi: Array, v: Array, once: Array, twice: Array) -> Array:
     return v + once[..., None] * cross + twice[..., None] * jnp.cross(phi, cross)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class ExtendedPose:
     """Attitude, velocity and position; tangent order phi [rad], nu [m/s], rho [m].
 
@@ -49,7 +47,7 @@ class ExtendedPose:
     rotation: Rotation  # body to navigation
     velocity: Any  # (..., 3) m/s, navigation axes
     position: Any  # (..., 3) m, navigation axes
-    error: Side = field(default="right", metadata={"static": True})
+    error: Side = kind(default="right")
 
     dim = 9
     units: ClassVar[dict[str, str]] = {"velocity": "m/s", "position": "m"}

@@ -22,10 +22,10 @@ three either way: use the figures of your sensor if you have them.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import field
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,33 +34,8 @@ from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
 from robins.errors import require, require_known
+from robins.filters.values import value
 from robins.units import UnitError, parse
-
-T = TypeVar("T", bound=type)
-
-
-def checked_pytree(cls: T) -> T:
-    """Register a frozen dataclass as a pytree whose rebuilding skips its ``__post_init__``.
-
-    JAX rebuilds a record with tracers, batches, axis numbers and placeholders for leaves. Checks
-    and conversions are meant for user input, so they run only in the constructor and in
-    ``dataclasses.replace``. A field that is None is structure, not a leaf.
-    """
-    names = tuple(f.name for f in dataclasses.fields(cls))
-
-    def flatten(record: Any) -> tuple[tuple[Any, ...], None]:
-        keys = (jax.tree_util.GetAttrKey(name) for name in names)
-        return tuple((key, getattr(record, key.name)) for key in keys), None
-
-    def unflatten(_: None, values: Iterable[Any]) -> Any:
-        record = object.__new__(cls)
-        for name, value in zip(names, values, strict=True):
-            object.__setattr__(record, name, value)
-        return record
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
-    return cls
-
 
 MARKOV_PEAK = 0.6173642831
 """Largest Allan deviation of a Gauss-Markov process over its sigma, at 1.893 correlation times."""
@@ -69,8 +44,7 @@ FLICKER_FLAT = float(np.sqrt(2.0 * np.log(2.0) / np.pi))
 """Allan deviation of flicker noise over its coefficient B, 0.664 (IEEE Std 952)."""
 
 
-@checked_pytree
-@dataclass(frozen=True, eq=False)
+@value
 class TriadErrors:
     """Errors of three gyros or three accelerometers; None: the sensor has no such error.
 
@@ -108,8 +82,7 @@ class TriadErrors:
             raise ValueError("markov_sigma and markov_tau_s belong together: give both or neither")
 
 
-@checked_pytree
-@dataclass(frozen=True, eq=False)
+@value
 class ImuErrorModel:
     """Errors of the gyros and accelerometers of an inertial measurement unit.
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from robins import _float64
 from robins.dataset import Trajectory
 from robins.earth import A_M, E2, OMEGA_E, Geodetic
+from robins.errors import require
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, displacement
 from robins.ins.kernel import one_kernel, pack
@@ -91,8 +92,7 @@ def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> N
     """
     _float64.require()
     refuse_polar(nav.position.lat)
-    if chunk < 1:
-        raise ValueError(f"chunk = {chunk}: at least one increment is taken at a time")
+    require(chunk >= 1, f"chunk = {chunk}: at least one increment is taken at a time")
     inc = Increments(*(None if a is None else np.asarray(a, float) for a in increments))
     total = len(inc.dt)
     size = max(min(chunk, total), 1)

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc
 
 from robins import _float64  # noqa: F401
-from robins.earth.stars import StarIndex, Stars, near
+from robins.earth.stars import StarIndex, Stars, near, refuse_other_lengths
 from robins.errors import require
 from robins.filters.belief import Number
 from robins.rotation import rotate
@@ -91,13 +91,10 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     unit = np.asarray(stars.unit_i, float)
     if unit.ndim != 2 or unit.shape[1] != 3 or len(unit) < 4:
         raise ValueError(f"unit_i must have shape (N, 3), N four at least, got {unit.shape}")
-    off = np.flatnonzero(~(np.abs(np.linalg.norm(unit, axis=1) - 1.0) < 1e-9))
-    if off.size:
-        raise ValueError(f"unit_i[{off[0]}] is {unit[off[0]]}: directions must be unit vectors")
+    refuse_other_lengths(unit)
     tree = KDTree(unit)
     pairs = tree.query_pairs(2.0 * np.sin(field / 2.0), output_type="ndarray")
-    if not len(pairs):
-        raise ValueError(f"no two stars are within the field of {np.degrees(field):g} deg")
+    require(len(pairs), f"no two stars are within the field of {np.degrees(field):g} deg")
     angle = _angle(unit[pairs[:, 0]], unit[pairs[:, 1]])
     order = np.argsort(angle, kind="stable")
     magnitude, identifier = np.asarray(stars.magnitude, float), np.asarray(stars.identifier, int)
@@ -105,7 +102,9 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     return PairIndex(unit, magnitude, identifier, first, second, angle[order], tree)
 
 
-def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
+def pairs_between(
+    index: PairIndex, low_rad: float, high_rad: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of stars with an angle from low to high, as two arrays of catalogue indices."""
     first = np.searchsorted(index.angle_rad, low_rad, side="left")
     rows = slice(first, np.searchsorted(index.angle_rad, high_rad, side="right"))

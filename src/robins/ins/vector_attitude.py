@@ -32,6 +32,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 from robins.filters.belief import Number
 from robins.rotation import from_dcm, multiply, normalise, rotate
 
@@ -205,8 +206,7 @@ def attitude_from_vectors(
             apart.
     """
     b, r = np.asarray(vectors_b, float), np.asarray(vectors_i, float)
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    require(method in METHODS, f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if b.ndim != 2 or b.shape[1] != 3 or r.shape != b.shape:
         raise ValueError(
             f"vectors_b and vectors_i must have one shape (n, 3), got {b.shape} and {r.shape}"

@@ -17,7 +17,7 @@ from robins.program.layout import IN_PLACE, Array, MemoryLayout, operands
 from robins.program.nodes import GraphLoop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
-from robins.program.walk import Program
+from robins.program.walk import Program, flat
 from robins.program.wrap import wrapped
 
 PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}
@@ -63,7 +63,7 @@ class _Writer:
         self.inlined: set[Node] = set()
         self.strides: dict[Node, tuple[Array, int, int]] = {}  # arrays that lie in another one
         live = program.live
-        self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
+        self.results = flat(program.outputs)
         roots = [*self.results]
         users: dict[Node, list[Node]] = defaultdict(list)
         for node in live:

@@ -18,7 +18,7 @@ from robins.program.native import address
 from robins.program.nodes import GraphLoop, Node
 from robins.program.operations import KINDS
 from robins.program.refusal import ProgramError
-from robins.program.walk import Program, counts
+from robins.program.walk import Program, counts, flat
 
 DEEPEST = 16  # nested loops: the interpreter has so many counters of rounds
 CHANGES = ("keep", "move")  # instructions that change what is there
@@ -81,7 +81,7 @@ class Writer:
         self.scope_of: dict[Value, int] = {}  # the loop in which a value is written
         self._places: dict[Value, Place] = {}
         live = program.live
-        self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
+        self.results = flat(program.outputs)
         self.inner: dict[int, list[Node]] = defaultdict(list)
         self.uses: Counter[Node] = Counter(self.results)
         for node in live:

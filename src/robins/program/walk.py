@@ -6,7 +6,7 @@ moves nodes, and so leaves no code. The rules are registered by `robins.program.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -33,6 +33,22 @@ OVERFLOWING = {
 }
 
 Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
+
+
+def flat(arrays: Iterable[Nodes]) -> list[Node]:
+    """List of the nodes of arrays, one after the other."""
+    return [n for a in arrays for n in a.ravel().tolist()]
+
+
+def shaped(nodes: Sequence[Node], shapes: Iterable[tuple[int, ...]]) -> list[Nodes]:
+    """Split a list of nodes into arrays of these shapes."""
+    out, at = [], 0
+    for shape in shapes:
+        end = at + int(np.prod(shape))
+        out.append(np.array(nodes[at:end], dtype=np.int64).reshape(shape))
+        at = end
+    return out
+
 
 Rule = Callable[..., Any]  # (walk, equation, *arrays) -> array, or a list of them
 RULES: dict[str, Rule] = {}
@@ -127,7 +143,7 @@ class Program:
     @cached_property
     def live(self) -> list[Node]:
         """The nodes that its results need, in the order of computation."""
-        return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
+        return self.graph.live(flat(self.outputs))
 
 
 def line_of(equation: Equation) -> str:

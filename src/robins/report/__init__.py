@@ -6,9 +6,8 @@ follows from the roles of the arrays in the solution: one row each in `robins.re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from typing import Any
 
 import xarray as xr
 
@@ -17,7 +16,7 @@ from robins.errors import moved
 from robins.report.document import LIMIT, ReportOrigin, page
 from robins.report.embed import RenderedPicture, dpi_for, draw
 from robins.report.figures import FIGURES, drawings
-from robins.report.numbers import verdict
+from robins.report.numbers import Summary, verdict
 from robins.report.style import Picture
 from robins.report.terminal import table
 
@@ -38,7 +37,7 @@ __all__ = [
 Progress = Callable[[int, int, str], None]
 
 
-def pictures(solution: xr.Dataset | None, summary: Mapping[str, Any]) -> list[Picture]:
+def pictures(solution: xr.Dataset | None, summary: Summary) -> list[Picture]:
     """Every figure that the arrays of a solution and the metrics of a summary allow."""
     return [picture for make in drawings(solution, summary) if (picture := make()) is not None]
 

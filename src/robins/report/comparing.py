@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from robins.report import numbers, series, style
+from robins.report.numbers import Summary, Values
 from robins.report.style import Picture
 from robins.results import Probability, find
 
@@ -16,7 +17,7 @@ _MOST = 12  # charts of one figure
 _COLUMNS = 3
 
 
-def metrics(filters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float | int | None]]:
+def metrics(filters: Mapping[str, Values]) -> dict[str, list[float | int | None]]:
     """Metrics that are one number in at least two filters, by name, in the filters' order."""
     names = dict.fromkeys(name for values in filters.values() for name in values)
     found = {}
@@ -33,7 +34,7 @@ def _is_number(value: Any) -> bool:
 
 
 @style.styled
-def comparison(summary: Mapping[str, Any]) -> Picture | None:
+def comparison(summary: Summary) -> Picture | None:
     """Bars of every metric the filters share; None if there is nothing to compare."""
     filters = list(summary["filters"])
     found = dict(list(metrics(summary["filters"]).items())[:_MOST])

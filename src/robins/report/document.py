@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from robins.report import numbers
 from robins.report.embed import Embedded, RenderedPicture, embed
+from robins.report.numbers import Claim, Summary, Values
 from robins.report.style import Picture
 
 LIMIT = 500_000  # bytes of the whole page
@@ -30,7 +31,7 @@ class ReportOrigin(NamedTuple):
 
 
 def page(
-    summary: Mapping[str, Any],
+    summary: Summary,
     drawn: Sequence[RenderedPicture],
     origin: ReportOrigin,
     limit: int = LIMIT,
@@ -41,7 +42,7 @@ def page(
     return _page(summary, _figures(embed(drawn, max(room, 0))), origin)
 
 
-def _page(summary: Mapping[str, Any], figures: str, origin: ReportOrigin) -> str:
+def _page(summary: Summary, figures: str, origin: ReportOrigin) -> str:
     title = escape(summary["scenario"])
     runs = "1 run" if summary["runs"] == 1 else f"{summary['runs']} runs"
     meta = [
@@ -69,7 +70,7 @@ def _page(summary: Mapping[str, Any], figures: str, origin: ReportOrigin) -> str
     )
 
 
-def _verdict(claims: Sequence[Mapping[str, Any]], sentence: str) -> str:
+def _verdict(claims: Sequence[Claim], sentence: str) -> str:
     if sentence:
         worst = numbers.state_of(sentence)
         return f'<p class="verdict {worst}">{_SIGNS.get(worst, "")} {escape(sentence)}</p>'
@@ -100,7 +101,7 @@ def _td(text: str, kind: str = "") -> str:
     return f'<td class="{kind}">{escape(text)}</td>'
 
 
-def _metrics(filters: Mapping[str, Mapping[str, Any]]) -> str:
+def _metrics(filters: Mapping[str, Values]) -> str:
     names = dict.fromkeys(name for values in filters.values() for name in values)
     if not names:
         return ""
@@ -119,7 +120,7 @@ def _metrics(filters: Mapping[str, Mapping[str, Any]]) -> str:
     return f"<section>\n<h2>Summary</h2>\n{_table(head, rows, 'metrics')}\n{note}</section>"
 
 
-def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
+def _claims(claims: Sequence[Claim]) -> str:
     if not claims:
         return ""
     head = [_th("Verdict"), _th("Claim"), _th("Found", "number"), _th("Band", "number")]
@@ -176,7 +177,7 @@ def _counts(counts: Mapping[str, int]) -> str:
     return f"<section>\n<h2>Refused samples</h2>\n{body}\n</section>"
 
 
-def _reproduce(summary: Mapping[str, Any], origin: ReportOrigin) -> str:
+def _reproduce(summary: Summary, origin: ReportOrigin) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
     command = origin.command or "(called from Python)"
     text = origin.scenario_text

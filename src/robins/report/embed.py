@@ -153,10 +153,6 @@ def _svg_source(content: bytes) -> str:
     return "data:image/svg+xml," + quote(flat, safe=" /:=;,.-+()'!*@?_~<>")
 
 
-def _png_source(content: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(content).decode()
-
-
 class _PictureForms:
     """The forms of one picture, each made only when it is needed.
 
@@ -178,16 +174,11 @@ class _PictureForms:
         """Number of characters."""
         return len(self.source)
 
-    @property
-    def is_last(self) -> bool:
-        """True if there is no coarser form."""
-        return self.rung + 1 == len(_LADDER)
-
     def _form(self, rung: int) -> str:
         if rung not in self._sources:
             share, colours, effort, _ = _LADDER[rung]
             made = packed(shrunk(self.drawn.dots, share), colours, effort)
-            self._sources[rung] = _png_source(made)
+            self._sources[rung] = "data:image/png;base64," + base64.b64encode(made).decode()
         return self._sources[rung]
 
     def take(self, rung: int) -> None:
@@ -234,7 +225,7 @@ def embed(drawn: Sequence[RenderedPicture], limit: int) -> list[Embedded]:
         choice.take(rung)
     _refine(choices, limit)
     while sum(c.size for c in choices) > limit:
-        if able := [c for c in choices if not c.is_last and c.source]:
+        if able := [c for c in choices if c.rung + 1 < len(_LADDER) and c.source]:
             one = max(able, key=lambda c: c.size)
             one.take(one.rung + 1)
         else:

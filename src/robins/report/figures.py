@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import xarray as xr
 
@@ -20,6 +20,7 @@ from robins.report import (
     updates,
 )
 from robins.report.lateness import lateness
+from robins.report.numbers import Summary
 from robins.report.style import Picture
 from robins.report.suspects import suspects
 from robins.report.tuning import tuning
@@ -90,7 +91,7 @@ FIGURES = (
 
 
 def drawings(
-    solution: xr.Dataset | None, summary: Mapping[str, Any], only: Sequence[str] = ()
+    solution: xr.Dataset | None, summary: Summary, only: Sequence[str] = ()
 ) -> list[Callable[[], Picture | None]]:
     """Functions that draw, in the order of the page; the comparison of a summary comes last.
 

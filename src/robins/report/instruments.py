@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -81,20 +79,15 @@ _NAMES = ("measured", "calibrated")
 _LOOKS = ({"color": style.colour(1)}, {"color": style.colour(0)})
 
 
-class _Field(NamedTuple):
-    values: list[np.ndarray]  # measured and calibrated (time, axis), in the display unit
-    strength: float
-    unit: str
-    time: np.ndarray
-    axes: list[str]
-
-
-def _field(solution: xr.Dataset) -> _Field:
+def _field(
+    solution: xr.Dataset,
+) -> tuple[list[np.ndarray], float, str, np.ndarray, list[str]]:
+    """Field measured and calibrated (time, axis), its size, their unit, times, names of axes."""
     before, after = (find(solution, f"field_{name}")[""] for name in _NAMES)
     values, unit = [series.shown(array)[0] for array in (before, after)], series.shown(after)[1]
     strength = float(units.convert(after.attrs["strength"], after.attrs["units"], unit))
     axes = series.coordinate(solution, before.dims[1])
-    return _Field(values, strength, unit, series.x_of(before, 0), axes)
+    return values, strength, unit, series.x_of(before, 0), axes
 
 
 @style.styled

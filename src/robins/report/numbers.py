@@ -7,9 +7,10 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from robins.results import Probability
+from robins.results.summary import Json
 
 # Parts of the unit at the end of a metric's name, and their printed form.
 _PARTS = {
@@ -27,7 +28,9 @@ _CAPITALS = {
     *("kf", "ekf", "mekf", "ukf", "sar", "rtk", "2d", "3d", "nhc", "zupt", "lmi"),
 }
 
-Values = Mapping[str, Any]  # metrics of a filter
+Values = Mapping[str, Json]  # metrics of a filter
+Claim = Mapping[str, Json]  # with its verdict
+Summary = Mapping[str, Json]  # contents of `summary.json`
 MARK = " !"  # behind a number outside its own band
 _STATES = {"Consistent": "reproduced", "With care": "partly", "Do not trust": "not"}
 _WORDS = {"euler": "Euler angles", "accel": "accelerometer"}
@@ -57,7 +60,7 @@ def words(name: str) -> str:
     return " ".join(_WORDS.get(w, w.upper() if w in _CAPITALS else w) for w in split)
 
 
-def show(value: Any) -> str:
+def show(value: Json) -> str:
     """A number to four significant digits; lists are joined; None is an en dash."""
     if value is None:
         return "–"
@@ -76,7 +79,7 @@ def show(value: Any) -> str:
     return str(value)
 
 
-def _many(values: Sequence[Any]) -> str:
+def _many(values: Sequence[Json]) -> str:
     """A list; of a long one, or one of lists, only its range and length."""
     nested = any(isinstance(item, Sequence) and not isinstance(item, str) for item in values)
     if len(values) <= _FEW and not nested:
@@ -108,7 +111,7 @@ def _float(value: float) -> str:
     return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
 
 
-def band(value: Any) -> str:
+def band(value: Json) -> str:
     """The band of a claim: two numbers as a range, with an open end where one is missing."""
     if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
         low, high = value
@@ -148,7 +151,7 @@ def found(
     return show(value) + (f" ({band(interval)})" if interval else "")
 
 
-def verdict(claims: Sequence[Mapping[str, Any]]) -> str:
+def verdict(claims: Sequence[Claim]) -> str:
     """One sentence on the claims."""
     if not claims:
         return "No claims are attached to this scenario."

@@ -10,12 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 from robins.report import numbers
+from robins.report.numbers import Summary
 
 _GAP = 2  # columns between columns
 _COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red", "undecided": "cyan"}
 
 
-def table(summary: Mapping[str, Any], width: int = 100) -> Group:
+def table(summary: Summary, width: int = 100) -> Group:
     """Metrics by filter, claims with verdicts and refused samples, as a rich renderable.
 
     Filters that do not fit side by side into ``width`` columns are shown in further tables.

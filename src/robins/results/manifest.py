@@ -10,12 +10,11 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from robins import __version__
 from robins.foreign import decoding
 from robins.results.errors import ResultError, cannot
-from robins.results.summary import dumps, loads, plain
+from robins.results.summary import Json, dumps, loads, plain
 
 SCHEMA_VERSION = 1
 NAME = "manifest.json"
@@ -24,14 +23,14 @@ _PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "xarray", "h5netcdf", "matplotli
 _REMAKE = "make the result again"
 
 
-def digest(path: Path) -> dict[str, Any]:
+def digest(path: Path) -> dict[str, Json]:
     """Size and SHA-256 of a file."""
     with open(path, "rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
         return {"sha256": found, "size": os.fstat(file.fileno()).st_size}
 
 
-def _seal(manifest: Mapping[str, Any]) -> str:
+def _seal(manifest: Mapping[str, Json]) -> str:
     """Checksum of the manifest itself, so that even a flipped bit in a seed is detected."""
     rest = {key: value for key, value in manifest.items() if key != "sha256"}
     return hashlib.sha256(dumps(rest).encode()).hexdigest()
@@ -55,7 +54,7 @@ def versions() -> dict[str, str]:
 
 def make(
     folder: Path, *, scenario: str, scenario_text: str, seed: int, device: str, command: str
-) -> dict[str, Any]:
+) -> dict[str, Json]:
     """Manifest of all files in a folder."""
     files = {
         path.relative_to(folder).as_posix(): digest(path)
@@ -82,7 +81,7 @@ def make(
     return manifest | {"sha256": _seal(manifest)}
 
 
-def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
+def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Json]:
     """Read a manifest and check that it is complete and of a known version.
 
     Raises:
@@ -130,7 +129,7 @@ def listed(folder: Path) -> set[str] | None:
     return {NAME, *files} if isinstance(files, dict) else None
 
 
-def verify(folder: Path, manifest: Mapping[str, Any], shown: str | os.PathLike[str]) -> None:
+def verify(folder: Path, manifest: Mapping[str, Json], shown: str | os.PathLike[str]) -> None:
     """Compare every file with its checksum.
 
     Raises:

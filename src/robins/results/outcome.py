@@ -9,6 +9,8 @@ from typing import Any
 
 import xarray as xr
 
+from robins.results.summary import Json
+
 Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
 
 
@@ -25,8 +27,8 @@ class Outcome:
     """
 
     solution: xr.Dataset | None = None  # None: there is nothing to draw
-    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # by filter, or by axis
-    claims: list[dict[str, Any]] = field(default_factory=list)
+    metrics: dict[str, dict[str, Json]] = field(default_factory=dict)  # by filter, or by axis
+    claims: list[dict[str, Json]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     files: dict[str, bytes | Path] = field(default_factory=dict)  # further ones; a path is moved in
     notes: list[str] = field(default_factory=list)  # sentences for the reader
@@ -50,7 +52,7 @@ class Outcome:
     failure: str = ""  # reason why it is incomplete; it is still written as a result
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Json]:
         """Contents of `summary.json`."""
         return {
             "scenario": self.scenario,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 import xarray as xr
@@ -12,14 +12,15 @@ import xarray as xr
 from robins.foreign import decoding
 from robins.results import dataframe, folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
+from robins.results.summary import Json
 
 
 class Result(NamedTuple):
     """A result read back."""
 
     path: Path
-    manifest: dict[str, Any]
-    summary: dict[str, Any]
+    manifest: dict[str, Json]
+    summary: dict[str, Json]
     solution: xr.Dataset | None  # None for a result without time series
 
     @property

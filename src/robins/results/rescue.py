@@ -14,6 +14,7 @@ import numpy as np
 from robins.errors import RobinsError
 from robins.results import folder
 
+Tree = Any  # arrays in lists and mappings
 ARRAYS = "arrays.npz"
 _WHERE = "Its numbers are kept in {}; numpy.load reads them."
 _KEPT = "computed"  # attribute of an error that carries the numbers
@@ -26,7 +27,7 @@ class NotWritten(RobinsError, RuntimeError):
 
 
 @contextmanager
-def keep_on_error(tree: Any) -> Generator[None, None, None]:
+def keep_on_error(tree: Tree) -> Generator[None, None, None]:
     """Attach computed arrays to any error that leaves this block, for `rescued` to write.
 
     Args:
@@ -52,12 +53,12 @@ def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
     try:
         yield
     except KeyboardInterrupt as stop:
-        kept = _saved(Path(path), vars(stop)[_KEPT]) if _KEPT in vars(stop) else None
+        kept = _saved(Path(path), stop)
         if kept is not None:
             stop.add_note(_WHERE.format(kept / ARRAYS))
         raise
     except Exception as error:
-        kept = _saved(Path(path), vars(error)[_KEPT]) if _KEPT in vars(error) else None
+        kept = _saved(Path(path), error)
         if kept is None:
             raise
         raise NotWritten(
@@ -66,9 +67,11 @@ def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
         ) from error
 
 
-def _saved(path: Path, tree: Any) -> Path | None:
-    """Save the arrays of a tree and return the folder; None if no disk takes them."""
-    arrays = dict(_arrays("", tree))
+def _saved(path: Path, error: BaseException) -> Path | None:
+    """Folder of the saved arrays of an error; None without any, or if no disk takes them."""
+    if _KEPT not in vars(error):
+        return None
+    arrays = dict(_arrays("", vars(error)[_KEPT]))
     for parent in (folder.resolve(path).parent, Path(tempfile.gettempdir())):
         try:
             parent.mkdir(parents=True, exist_ok=True)
@@ -80,7 +83,7 @@ def _saved(path: Path, tree: Any) -> Path | None:
     return None
 
 
-def _arrays(name: str, tree: Any) -> Iterator[tuple[str, np.ndarray]]:
+def _arrays(name: str, tree: Tree) -> Iterator[tuple[str, np.ndarray]]:
     """All arrays of a tree with their paths, such as ``ekf.rms``."""
     if isinstance(tree, list | tuple):
         tree = dict(enumerate(tree))

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import secrets
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from robins.foreign import arrays_of, decoding
 from robins.results.errors import ResultError, cannot
 from robins.results.folder import sync
 
+State = Any  # numbers, texts and arrays, in tuples, lists and mappings by name
 FORMAT, VERSION = "robins-live", 2
 _LARGEST = 1 << 30  # bytes of a file
 
@@ -30,10 +32,10 @@ class Snapshot(NamedTuple):
     """Contents of a file."""
 
     parameters: str  # TOML
-    state: Any  # as it was given to `write`, tuples as tuples, arrays as NumPy's
+    state: State  # as it was given to `write`, tuples as tuples, arrays as NumPy's
 
 
-def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) -> None:
+def write(path: str | os.PathLike[str], kind: str, parameters: str, state: State) -> None:
     """Write a snapshot; on failure an earlier file stays as it was.
 
     Args:
@@ -50,7 +52,7 @@ def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) 
     body = {"kind": kind, "parameters": parameters, "state": _frozen(state, arrays)}
     header = {"format": FORMAT, "version": VERSION, **body, "digest": _digest(body, arrays)}
     packed = io.BytesIO()
-    named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
+    named: dict[str, State] = {f"a{k}": a for k, a in enumerate(arrays)}
     np.savez(packed, told=np.frombuffer(json.dumps(header).encode(), np.uint8), **named)
     target = Path(os.path.realpath(path))
     aside = target.with_name(f".robins-live-{secrets.token_hex(6)}")
@@ -98,7 +100,7 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
 
 def _unpacked(
     content: bytes, path: str | os.PathLike[str]
-) -> tuple[dict[str, Any], list[np.ndarray]]:
+) -> tuple[dict[str, State], list[np.ndarray]]:
     def refuse(why: str) -> ResultError:
         what = f"it is damaged or no file of a live state ({why})"
         return ResultError(path, what, "start again, or restore an older one")
@@ -114,7 +116,7 @@ def _unpacked(
         return header, [packed[f"a{k}"] for k in range(len(packed))]
 
 
-def _digest(body: Any, arrays: list[np.ndarray]) -> str:
+def _digest(body: Mapping[str, State], arrays: list[np.ndarray]) -> str:
     seen = hashlib.sha256(json.dumps(body, sort_keys=True).encode())
     for a in arrays:
         seen.update(f"{a.dtype.str}{a.shape}".encode())
@@ -122,7 +124,7 @@ def _digest(body: Any, arrays: list[np.ndarray]) -> str:
     return seen.hexdigest()
 
 
-def _frozen(value: Any, arrays: list[np.ndarray]) -> Any:
+def _frozen(value: State, arrays: list[np.ndarray]) -> State:
     """Value in plain JSON, with an array replaced by its number in `arrays`."""
     if value is None or isinstance(value, bool | str) or type(value) in (int, float):
         return value
@@ -137,7 +139,7 @@ def _frozen(value: Any, arrays: list[np.ndarray]) -> Any:
     return {"array": len(arrays) - 1}
 
 
-def _thawed(value: Any, arrays: list[np.ndarray]) -> Any:
+def _thawed(value: State, arrays: list[np.ndarray]) -> State:
     if not isinstance(value, dict):
         return value
     ((kind, inner),) = value.items()

@@ -13,6 +13,7 @@ import numpy as np
 
 from robins.results.probability import Probability
 
+Json = Any  # a value of JSON, or one that `plain` makes into one
 VERDICTS = ("reproduced", "partly", "not", "undecided")
 
 _GIVEN = {
@@ -33,7 +34,7 @@ _ORDER = (
 )
 
 
-def plain(value: Any, where: str = "value") -> Any:
+def plain(value: Json, where: str = "value") -> Json:
     """Convert a value to types of JSON: NaN and infinities become null, arrays become lists.
 
     Raises:
@@ -66,7 +67,7 @@ def plain(value: Any, where: str = "value") -> Any:
     raise TypeError(f"{where}: {type(value).__name__} has no form in JSON")
 
 
-def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
+def checked(summary: Mapping[str, Json]) -> dict[str, Json]:
     """Check a summary; return it in plain types and documented order, `files` left to the writer.
 
     Raises:
@@ -109,19 +110,19 @@ def _name(kind: type) -> str:
     return named.get(kind, "a number")
 
 
-def dumps(value: Any) -> str:
+def dumps(value: Json) -> str:
     """Strict JSON text, indented, ending with a line break."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def loads(text: str | bytes) -> Any:
+def loads(text: str | bytes) -> Json:
     """Parse strict JSON.
 
     Raises:
         ValueError: the text is not JSON, or holds NaN or Infinity, which JSON does not have.
     """
 
-    def refuse(constant: str) -> Any:
+    def refuse(constant: str) -> Json:
         raise ValueError(f"{constant} is not JSON")
 
     return json.loads(text, parse_constant=refuse)

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from time import monotonic, sleep
-from typing import Any
 
 import xarray as xr
 
 from robins.results import folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
+from robins.results.summary import Json
 
 SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
 _POLL_S = 0.2
@@ -53,7 +53,7 @@ class ResultWriter:
     ):
         self.path = Path(path)
         self.scenario_text, self.device, self.command = scenario_text, device, command
-        self.summary: dict[str, Any] | None = None
+        self.summary: dict[str, Json] | None = None
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
         self._moved: list[Path] = []
@@ -71,7 +71,7 @@ class ResultWriter:
         self._write(SOLUTION, solution.pack(dataset))
         self.solution = dataset
 
-    def save_summary(self, values: Mapping[str, Any]) -> None:
+    def save_summary(self, values: Mapping[str, Json]) -> None:
         """Set the contents of `summary.json`; `files` is filled in, `seconds` if it is not given.
 
         Raises:
@@ -147,12 +147,12 @@ class ResultWriter:
         self.discard()
         return self.path
 
-    def _files(self) -> dict[str, Any]:
+    def _files(self) -> dict[str, Json]:
         """Files of the folder, by kind, as paths inside it."""
         here = self._stage.path
         names = sorted(p.relative_to(here).as_posix() for p in here.rglob("*") if p.is_file())
         own = {"solution": SOLUTION, "report": REPORT}
-        files: dict[str, Any] = {"summary": SUMMARY, "manifest": manifest.NAME}
+        files: dict[str, Json] = {"summary": SUMMARY, "manifest": manifest.NAME}
         files |= {kind: name for kind, name in own.items() if name in names}
         files["figures"] = [name for name in names if name.startswith(f"{FIGURES}/")]
         known = {SUMMARY, manifest.NAME, *own.values(), *files["figures"]}

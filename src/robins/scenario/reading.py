@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -18,6 +18,8 @@ import pydantic_core
 from robins.scenario.parameters import Parameters
 from robins.scenario.text import (
     ScenarioError,
+    Table,
+    Toml,
     date_text,
     dotted,
     mapping_of,
@@ -30,7 +32,7 @@ from robins.scenario.text import (
 
 def faults(
     cls: type[pydantic.BaseModel],
-    mapping: Mapping[str, Any],
+    mapping: Table,
     errors: list[pydantic_core.ErrorDetails],
 ) -> list[str]:
     """One line for each fault in the tables of a scenario, unknown keys first."""
@@ -53,7 +55,7 @@ def faults(
     return [*lines, *missing.values(), *wrong]
 
 
-def _locate(mapping: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any]:
+def _locate(mapping: Toml, loc: tuple[int | str, ...]) -> tuple[list[int | str], Toml]:
     """Path and value of a fault, without pydantic's names for the branches of a union."""
     path: list[int | str] = []
     value: Any = mapping
@@ -67,7 +69,7 @@ def _locate(mapping: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], 
     return path, value
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Toml) -> str:
     text = shown_value(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -170,7 +172,7 @@ def parse(cls: type[P], text: str, settings: Iterable[str] = (), *, source: str 
     return validate(cls, override(mapping_of(text, source=source), settings), source=source)
 
 
-def validate(cls: type[P], mapping: Mapping[str, Any], *, source: str = "") -> P:
+def validate(cls: type[P], mapping: Table, *, source: str = "") -> P:
     """Check the tables of a scenario.
 
     Raises:

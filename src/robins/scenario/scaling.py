@@ -9,12 +9,12 @@ from typing import Any
 import pydantic
 
 from robins.scenario.parameters import Parameters
-from robins.scenario.text import ScenarioError, shown_value
+from robins.scenario.text import ScenarioError, Table, Toml, shown_value
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 
 
-def written(parameters: Parameters, mapping: Mapping[str, Any], key: str) -> Any:
+def written(parameters: Parameters, mapping: Table, key: str) -> Toml:
     """A parameter as the scenario writes it, or as its class writes its default.
 
     Args:
@@ -49,7 +49,7 @@ def written(parameters: Parameters, mapping: Mapping[str, Any], key: str) -> Any
     return value
 
 
-def scaled(key: str, value: Any, factor: float) -> Any:
+def scaled(key: str, value: Toml, factor: float) -> Toml:
     """A value as it is written, times a factor: a number, a text with a unit, or a list of these.
 
     Raises:
@@ -61,7 +61,7 @@ def scaled(key: str, value: Any, factor: float) -> Any:
     return of
 
 
-def _scaled(key: str, value: Any, factor: float) -> Any:
+def _scaled(key: str, value: Toml, factor: float) -> Toml:
     if isinstance(value, list | tuple):
         return [_scaled(key, one, factor) for one in value]
     found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
@@ -72,6 +72,6 @@ def _scaled(key: str, value: Any, factor: float) -> Any:
     raise ScenarioError([f"{key} = {shown_value(value)}: is no number that could be scaled"])
 
 
-def setting(key: str, value: Any) -> str:
+def setting(key: str, value: Toml) -> str:
     """The text ``key=value`` that sets a parameter to a value as it is written."""
     return f"{key}={value if isinstance(value, str) else shown_value(value)}"

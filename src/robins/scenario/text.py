@@ -12,6 +12,9 @@ from typing import Any
 
 from robins.errors import RobinsError
 
+Toml = Any  # a value of TOML: text, number, flag, date, list or table
+Table = Mapping[str, Toml]
+
 
 class ScenarioError(RobinsError, ValueError):
     """A scenario that cannot be used; `faults` has one line for each fault."""
@@ -50,7 +53,7 @@ def read_text(path: str | Path) -> str:
     return text
 
 
-def mapping_of(text: str, *, source: str = "") -> dict[str, Any]:
+def mapping_of(text: str, *, source: str = "") -> dict[str, Toml]:
     """Parse a TOML text into its tables.
 
     Raises:
@@ -62,7 +65,7 @@ def mapping_of(text: str, *, source: str = "") -> dict[str, Any]:
         raise ScenarioError([named(source, f"not TOML: {error}")]) from None
 
 
-def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, Any]:
+def override(mapping: Table, settings: Iterable[str]) -> dict[str, Toml]:
     """Copy of the tables with ``path=value`` settings applied; later ones override earlier ones.
 
     The value is read as TOML (``3``, ``true``, ``["1 m", "2 m"]``), else it is text as it stands
@@ -95,18 +98,18 @@ def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, A
     return out
 
 
-def text_of(mapping: Mapping[str, Any]) -> str:
+def text_of(mapping: Table) -> str:
     """TOML text of the tables, so that a changed scenario can be kept and run again."""
     return "\n".join(_toml_lines(mapping, ())) + "\n"
 
 
-def _copy(value: Any) -> Any:
+def _copy(value: Toml) -> Toml:
     if isinstance(value, Mapping):
         return {k: _copy(v) for k, v in value.items()}
     return [_copy(v) for v in value] if isinstance(value, list) else value
 
 
-def _value(raw: str) -> Any:
+def _value(raw: str) -> Toml:
     try:
         read = tomllib.loads(f"value = {raw}")
     except (ValueError, RecursionError):
@@ -114,19 +117,19 @@ def _value(raw: str) -> Any:
     return read["value"] if list(read) == ["value"] else raw
 
 
-def date_text(value: Any) -> str:
+def date_text(value: Toml) -> str:
     """A date or time as TOML and JSON write it."""
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     raise TypeError(f"{value!r} is nothing a scenario can hold")
 
 
-def _key(key: object) -> str:
+def _key(key: str | int) -> str:
     text = str(key)
     return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else _quoted(text)
 
 
-def dotted(path: Iterable[object]) -> str:
+def dotted(path: Iterable[str | int]) -> str:
     """A path as TOML writes it: ``imu.gyro_bias``."""
     return ".".join(map(_key, path))
 
@@ -136,7 +139,7 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def shown_value(value: Any) -> str:
+def shown_value(value: Toml) -> str:
     """A value as TOML writes it, on one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(k)} = {shown_value(v)}" for k, v in value.items()) + "}"
@@ -149,7 +152,7 @@ def shown_value(value: Any) -> str:
     return repr(value) if isinstance(value, int | float) else date_text(value)
 
 
-def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+def _toml_lines(table: Table, path: tuple[str, ...]) -> Iterator[str]:
     plain = {k: v for k, v in table.items() if not isinstance(v, Mapping)}
     if path and (plain or not table):
         yield f"[{dotted(path)}]"

@@ -32,16 +32,13 @@ class Reference(NamedTuple):
     alpha_b: Any  # (E, 3) its derivative [rad/s^2], in the reference body axes
 
 
+@jax.jit
 def nadir(orbit: OrbitStates) -> Reference:
     """Nadir-pointing reference: x forward, y against the orbit normal, z to the Earth's centre.
 
     The rate is that of any two-body orbit, -|r x v|/r^2 about y.
     """
-    return _nadir(orbit.r_i_m, orbit.v_i_m_s)
-
-
-@jax.jit
-def _nadir(r, v) -> Reference:
+    r, v = orbit.r_i_m, orbit.v_i_m_s
     r_sq = jnp.sum(r * r, -1)
     normal = jnp.cross(r, v)
     area = jnp.sqrt(jnp.sum(normal * normal, -1))

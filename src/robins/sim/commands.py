@@ -19,7 +19,16 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.earth import Geodetic
-from robins.sim.trajectory import MotionProfile, Vehicle, along, from_velocity, quaternion
+from robins.errors import require
+from robins.sim.trajectory import (
+    MotionProfile,
+    Vehicle,
+    along,
+    from_velocity,
+    knots_of,
+    quaternion,
+    smooth,
+)
 
 _EASE = 0.3  # share of a ramp in which its rate rises, and in which it falls
 _STILL = 0.5  # m/s; a height is not changed below this ground speed
@@ -105,15 +114,14 @@ def from_commands(
         ValueError: a duration or period that is not positive, a negative speed, a change of height
             while standing, or a pole.
     """
-    if not commands:
-        raise ValueError("commands: the list is empty")
+    require(commands, "commands: the list is empty")
     for k, command in enumerate(commands):
         if not (command.duration_s > 0.0 and command.wave_period_s > 0.0):
             raise ValueError(f"command {k}, {command}: duration and period must be positive")
         if command.speed_mps is not None and command.speed_mps < 0.0:
             raise ValueError(f"command {k}, {command}: a ground speed is not negative")
     total = float(sum(c.duration_s for c in commands))
-    t = np.linspace(0.0, total, max(int(np.ceil(total * knots_hz)), 8) + 1)
+    t = knots_of(total, knots_hz)
     speed, heading = np.full_like(t, speed_mps), np.full_like(t, heading_rad)
     rate = np.zeros_like(t)  # vertical rate [m/s]
     begin, before = 0.0, speed_mps
@@ -153,11 +161,7 @@ def _ramp(u, ease):
     fallen = area(fall) + np.maximum(u - 1.0, 0.0)
     top = 1.0 / (1.0 - ease)
     # Rounding must not overshoot: a speed of -1e-15 m/s would reverse the heading.
-    return np.clip(top * (risen - fallen), 0.0, 1.0), top * (_smooth(rise) - _smooth(fall))
-
-
-def _smooth(s):
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    return np.clip(top * (risen - fallen), 0.0, 1.0), top * (smooth(rise) - smooth(fall))
 
 
 def _wave(t, duration, period):
@@ -165,7 +169,7 @@ def _wave(t, duration, period):
     ease = min(period, 0.5 * duration)
     s = np.clip(np.minimum(t, duration - t) / ease, 0.0, 1.0)
     side = np.where(t < 0.5 * duration, 1.0, -1.0) / ease
-    window, slope = _smooth(s), 30.0 * s**2 * (1.0 - s) ** 2 * side
+    window, slope = smooth(s), 30.0 * s**2 * (1.0 - s) ** 2 * side
     phase = 2.0 * np.pi * t / period
     sine, cosine = np.sin(phase), np.cos(phase)
     return window * sine, slope * sine + 2.0 * np.pi / period * window * cosine

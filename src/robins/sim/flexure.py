@@ -24,6 +24,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64, linalg  # noqa: F401
+from robins.errors import require
 
 _WN_TAU = 2.146  # (1 + x) exp(-x) = 1/e
 
@@ -113,8 +114,7 @@ def simulate_flexure(
 
 
 def _check(model: Flexure, count: int, load_factor: ArrayLike | None) -> None:
-    if count < 1:
-        raise ValueError(f"flexure: count is {count}; at least one step is wanted")
+    require(count >= 1, f"flexure: count is {count}; at least one step is wanted")
     if model.tail_dof is not None and not model.tail_dof > 2.0:
         raise ValueError(
             f"flexure: tail_dof is {model.tail_dof}; Student's t has a variance above 2 only"

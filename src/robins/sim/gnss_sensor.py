@@ -11,8 +11,6 @@ where the truth is given at the instants ``valid_s``. North-east-down and forwar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,33 +24,18 @@ from robins import _float64  # noqa: F401
 from robins.dataset import GnssTable
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.errors import require
-from robins.ins.imu_errors import checked_pytree
+from robins.filters.values import value
 from robins.rotation import rotate
 from robins.sim import _given
 
 # The draws at a fix are part of the file format, as `robins.sim.random.Component` is.
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
+_ROWS = 5  # of three normal numbers, by the error that they are for
+_POSITION, _VELOCITY, _MARKOV, _POSITION_OUTLIER, _VELOCITY_OUTLIER = range(_ROWS)
+_DROPPED, _OUTLIER = 0, 1  # uniform numbers
 
 
-class _FixRow(IntEnum):
-    """Rows of the normal numbers (5, 3) of one fix."""
-
-    POSITION = 0
-    VELOCITY = 1
-    MARKOV = 2
-    OUTLIER_POSITION = 3
-    OUTLIER_VELOCITY = 4
-
-
-class _FixChance(IntEnum):
-    """Uniform numbers (2,) of one fix."""
-
-    DROPPED = 0
-    OUTLIER = 1
-
-
-@checked_pytree
-@dataclass(frozen=True, eq=False)
+@value
 class GnssErrorModel:
     """Errors of a GNSS receiver; vectors are north, east, down, or one number for all three.
 
@@ -216,10 +199,10 @@ def _position_errors(
 ) -> tuple[Array, Array]:
     """(m, 3) errors north, east, down [m], and the sigmas that the receiver states."""
     rows = partial(_rows, len(time_s))
-    draws = normal[:, _FixRow.POSITION], normal[:, _FixRow.OUTLIER_POSITION]
+    draws = normal[:, _POSITION], normal[:, _POSITION_OUTLIER]
     error_m, sigma_m = rows(model.sigma_m) * _standard(*draws, gross), rows(model.sigma_m)
     if model.markov_sigma_m is not None:
-        slow = _markov(time_s, rows(model.markov_tau_s), normal[:, _FixRow.MARKOV])
+        slow = _markov(time_s, rows(model.markov_tau_s), normal[:, _MARKOV])
         error_m = error_m + rows(model.markov_sigma_m) * slow
         sigma_m = jnp.sqrt(sigma_m**2 + rows(model.markov_sigma_m) ** 2)
     if model.stated_sigma_m is not None:
@@ -267,8 +250,8 @@ def observe(
 
     numbers = jnp.arange(len(time))
     normal, chance = jax.vmap(lambda number: _drawn(key, number))(numbers)
-    missing = _lost(model, time, chance[:, _FixChance.DROPPED])
-    outlier = chance[:, _FixChance.OUTLIER] < model.outlier_share
+    missing = _lost(model, time, chance[:, _DROPPED])
+    outlier = chance[:, _OUTLIER] < model.outlier_share
     gross = jnp.where(outlier, model.outlier_size, 0.0)[:, None]
     rows = partial(_rows, len(time))
     error_m, sigma_m = _position_errors(model, time, normal, gross)
@@ -277,7 +260,7 @@ def observe(
     lat, lon, alt = (jnp.where(missing, jnp.nan, x) for x in places)
     v_measured, sigma_v = None, None
     if model.sigma_v is not None:
-        draws = normal[:, _FixRow.VELOCITY], normal[:, _FixRow.OUTLIER_VELOCITY]
+        draws = normal[:, _VELOCITY], normal[:, _VELOCITY_OUTLIER]
         error_v = rows(model.sigma_v) * _standard(*draws, gross)
         v_measured = jnp.where(missing[:, None], jnp.nan, v + error_v)
         sigma_v = rows(model.sigma_v if model.stated_sigma_v is None else model.stated_sigma_v)
@@ -288,9 +271,7 @@ def _drawn(key: Array, number: Array) -> tuple[Array, Array]:
     normals, chances = (
         jax.random.fold_in(jax.random.fold_in(key, which), number) for which in (_NORMALS, _CHANCES)
     )
-    return jax.random.normal(normals, (len(_FixRow), 3)), jax.random.uniform(
-        chances, (len(_FixChance),)
-    )
+    return jax.random.normal(normals, (_ROWS, 3)), jax.random.uniform(chances, (2,))
 
 
 def _markov(time: Array, tau: Array, normal: Array) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins.dataset import ImuTable, Trajectory
+from robins.errors import require
 from robins.ins.frames import swap
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, step, step_each
@@ -63,8 +64,7 @@ def ideal_increments(
         ValueError: the trajectory is too short or near a pole, its time does not increase, or the
             body turns too far within a sample.
     """
-    if len(trajectory) < 2:
-        raise ValueError(f"{len(trajectory)} row(s): an increment needs two")
+    require(len(trajectory) >= 2, f"{len(trajectory)} row(s): an increment needs two")
     refuse_polar(trajectory.lat_rad)
     before, after = (nav_at(trajectory, rows, np) for rows in (slice(-1), slice(1, None)))
     n = len(trajectory) - 1

@@ -16,7 +16,6 @@ All is pure JAX: map over ``key`` for a batch of runs, and over a stacked model 
 from __future__ import annotations
 
 import dataclasses
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
@@ -36,23 +35,12 @@ from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 # accelerometers. A counter-based generator fills the rows in order, so none depends on later rows.
 _ONCE, _SAMPLES = 0, 1  # streams folded into the key of the unit
 
-
-class _SwitchOnRow(IntEnum):
-    """First row of each error among the numbers drawn at switch-on."""
-
-    MARKOV_START = 0
-    BIAS = 1
-    SCALE = 2
-    MISALIGNMENT = 3  # three rows
-    G_SENSITIVITY = 6  # three rows
-
-
-class _SampleRow(IntEnum):
-    """Row of each error among the numbers drawn at a sample."""
-
-    WHITE = 0  # white noise, and the integrals of the processes given their values at both ends
-    MARKOV = 1
-    WALK = 2
+# First row of each error among the numbers drawn at switch-on; the last two have three rows.
+_MARKOV_START, _BIAS, _SCALE, _MISALIGNMENT, _G_SENSITIVITY = 0, 1, 2, 3, 6
+# Fields of the errors that need a row of the numbers drawn at a sample, in their order. The first
+# is also for the integrals of the processes given their values at both ends.
+_WHITE, _MARKOV, _WALK = range(3)
+_SAMPLED = ("white", "markov_sigma", "walk")
 
 
 class TriadTruth(NamedTuple):
@@ -71,15 +59,11 @@ class ImuTruth(NamedTuple):
     accel: TriadTruth
 
 
-class _Constants(NamedTuple):
-    bias: Any  # (3,); None, here as below, where there is none
-    matrix: Any  # (3, 3) S + M
-    g_sensitivity: Any  # (3, 3)
-
-
 class _Triad(NamedTuple):
     errors: TriadErrors
-    constants: _Constants
+    bias: Any  # (3,) constant; None, here as below, where there is none
+    matrix: Any  # (3, 3) S + M
+    g_sensitivity: Any  # (3, 3)
 
 
 class SimulatedImu(NamedTuple):
@@ -207,19 +191,19 @@ def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuT
 def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Number | None]:
     """A triad and the start of its Gauss-Markov bias, from normal numbers (9, 3)."""
 
-    def drawn(row: _SwitchOnRow, given: Number | None, sigma: Number | None) -> Number | None:
+    def drawn(row: int, given: Number | None, sigma: Number | None) -> Number | None:
         if sigma is None:
             return given
         normal = numbers[row] if jnp.ndim(sigma) == 1 else numbers[row : row + 3]
         return _sum(given, sigma * normal)
 
-    bias = drawn(_SwitchOnRow.BIAS, errors.bias, errors.bias_sigma)
-    scale = drawn(_SwitchOnRow.SCALE, errors.scale, errors.scale_sigma)
-    sheared = drawn(_SwitchOnRow.MISALIGNMENT, errors.misalignment, errors.misalignment_sigma)
-    bent = drawn(_SwitchOnRow.G_SENSITIVITY, errors.g_sensitivity, errors.g_sensitivity_sigma)
+    bias = drawn(_BIAS, errors.bias, errors.bias_sigma)
+    scale = drawn(_SCALE, errors.scale, errors.scale_sigma)
+    sheared = drawn(_MISALIGNMENT, errors.misalignment, errors.misalignment_sigma)
+    bent = drawn(_G_SENSITIVITY, errors.g_sensitivity, errors.g_sensitivity_sigma)
     matrix = _sum(None if scale is None else jnp.diag(scale), sheared)
-    constants = _Constants(bias, matrix, bent)
-    return _Triad(errors, constants), drawn(_SwitchOnRow.MARKOV_START, None, errors.markov_sigma)
+    markov = drawn(_MARKOV_START, None, errors.markov_sigma)
+    return _Triad(errors, bias, matrix, bent), markov
 
 
 def _start(errors: TriadErrors, markov: Number | None) -> _TriadState:
@@ -230,14 +214,9 @@ def _start(errors: TriadErrors, markov: Number | None) -> _TriadState:
 
 def _normals(imu: SimulatedImu, number: Array) -> Array:
     """Standard normal numbers (rows, 2, 3) of one sample, as many rows as the errors need."""
-    rows = 0
-    for errors in (imu.gyro.errors, imu.accel.errors):
-        if errors.walk is not None:
-            rows = max(rows, _SampleRow.WALK + 1)
-        if errors.markov_sigma is not None:
-            rows = max(rows, _SampleRow.MARKOV + 1)
-        if errors.white is not None:
-            rows = max(rows, _SampleRow.WHITE + 1)
+    both = imu.gyro.errors, imu.accel.errors
+    there = [any(getattr(one, name) is not None for one in both) for name in _SAMPLED]
+    rows = max((row + 1 for row, some in enumerate(there) if some), default=0)
     if rows == 0:
         return jnp.zeros((0, 2, 3))
     return jax.random.normal(jax.random.fold_in(imu.key, number), (rows, 2, 3))
@@ -253,28 +232,28 @@ def _sample(imu: SimulatedImu, state: ImuState, normals, dt, theta, dv):
 
 def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv):
     """One sample of one triad: state, increment, (bias, clipped); dv is the true one."""
-    errors, constants = triad.errors, triad.constants
-    now = constants.bias  # bias at the end of the sample
+    errors = triad.errors
+    now = triad.bias  # bias at the end of the sample
     added = None if now is None else now * dt  # its contribution to the increment
     markov, walk, residue = state
     spread_sq = None if errors.white is None else errors.white**2 * dt
     if markov is not None:
         markov, integral, rest = markov_step(
-            markov, errors.markov_sigma, errors.markov_tau_s, dt, normals[_SampleRow.MARKOV]
+            markov, errors.markov_sigma, errors.markov_tau_s, dt, normals[_MARKOV]
         )
         now, added, spread_sq = _sum(now, markov), _sum(added, integral), _sum(spread_sq, rest)
     if walk is not None:
-        walk, integral, rest = walk_step(walk, errors.walk, dt, normals[_SampleRow.WALK])
+        walk, integral, rest = walk_step(walk, errors.walk, dt, normals[_WALK])
         now, added, spread_sq = _sum(now, walk), _sum(added, integral), _sum(spread_sq, rest)
     if spread_sq is not None:
-        added = _sum(added, jnp.sqrt(spread_sq) * normals[_SampleRow.WHITE])
+        added = _sum(added, jnp.sqrt(spread_sq) * normals[_WHITE])
     if errors.ramp is not None:
         now = _sum(now, errors.ramp * (elapsed_s + dt))
         added = _sum(added, errors.ramp * (dt * (elapsed_s + 0.5 * dt)))
-    if constants.matrix is not None:
-        added = _sum(added, constants.matrix @ true)
-    if constants.g_sensitivity is not None:
-        added = _sum(added, constants.g_sensitivity @ dv)
+    if triad.matrix is not None:
+        added = _sum(added, triad.matrix @ true)
+    if triad.g_sensitivity is not None:
+        added = _sum(added, triad.g_sensitivity @ dv)
 
     out = true if added is None else true + added
     clipped = jnp.zeros(3, bool)
@@ -292,7 +271,7 @@ def _truth(imu: SimulatedImu, seen) -> ImuTruth:
     none = jnp.zeros((3, 3))
 
     def of(triad: _Triad, bias: Array, clipped: Array) -> TriadTruth:
-        matrix, bent = (none if m is None else m for m in triad.constants[1:])
+        matrix, bent = (none if m is None else m for m in triad[2:])
         return TriadTruth(bias, clipped, matrix, bent)
 
     return ImuTruth(of(imu.gyro, *seen[0]), of(imu.accel, *seen[1]))

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.earth import Geodetic, gravity
 from robins.errors import require
-from robins.sim.trajectory import MotionProfile, along, from_velocity, quaternion
+from robins.sim.trajectory import MotionProfile, along, from_velocity, knots_of, quaternion, smooth
 
 _STEEPEST_RAD = np.deg2rad(85.0)
 _KNOTS_A_PERIOD = 20
@@ -98,10 +98,10 @@ def fly(
             raise ValueError(
                 f"bank {k} is {np.rad2deg(leg.bank_rad):g} deg; a level turn needs less than 85 deg"
             )
-    t = _times(float(sum(leg.duration_s for leg in banks)), knots_hz)
+    t = knots_of(float(sum(leg.duration_s for leg in banks)), knots_hz)
     bank, begin, before = np.zeros_like(t), 0.0, 0.0
     for leg in banks:
-        bank += (leg.bank_rad - before) * _ease((t - begin) / roll_s)
+        bank += (leg.bank_rad - before) * smooth(np.clip((t - begin) / roll_s, 0.0, 1.0))
         begin, before = begin + leg.duration_s, leg.bank_rad
     g = float(np.asarray(gravity(start.lat, start.alt)))
     turn = make_interp_spline(t, g * np.tan(bank) / speed_mps, k=5).antiderivative()
@@ -136,7 +136,7 @@ def sail(
     """
     _positive(duration_s=duration_s, knots_hz=knots_hz)
     require(speed_mps >= 0.0, f"speed_mps is {speed_mps}: a ground speed is not negative")
-    t = _times(duration_s, _dense(knots_hz, *sea))
+    t = knots_of(duration_s, _dense(knots_hz, *sea))
     roll, pitch, yaw, heave = (_sum(waves, t) for waves in sea)
     v_n = np.empty((len(t), 3))
     v_n[:, 0], v_n[:, 1] = speed_mps * np.cos(heading_rad), speed_mps * np.sin(heading_rad)
@@ -156,16 +156,12 @@ def roughen(
     Raises:
         ValueError: a period that is not positive.
     """
-    t = _times(motion.duration_s, _dense(knots_hz, roll, pitch))
+    t = knots_of(motion.duration_s, _dense(knots_hz, roll, pitch))
     sway = quaternion(_sum(roll, t), _sum(pitch, t), np.zeros_like(t))
     k = motion.at(t)
     base, top = (_Rotation.from_quat(q, scalar_first=True) for q in (k.q_nb, sway))
     origin = Geodetic(k.lat[0], k.lon[0], k.alt[0])
     return from_velocity(t, k.v_n, origin, (base * top).as_quat(scalar_first=True))
-
-
-def _times(duration_s: float, knots_hz: float) -> np.ndarray:
-    return np.linspace(0.0, duration_s, max(int(np.ceil(duration_s * knots_hz)), 8) + 1)
 
 
 def _dense(knots_hz: float, *sums: Sequence[Wave]) -> float:
@@ -188,12 +184,6 @@ def _slope(waves: Sequence[Wave], t: np.ndarray) -> np.ndarray:
         omega = 2.0 * np.pi / wave.period_s
         total += wave.amplitude * omega * np.cos(omega * t + wave.phase_rad)
     return total
-
-
-def _ease(u: np.ndarray) -> np.ndarray:
-    """Rise from 0 to 1 over u in [0, 1] with two continuous derivatives."""
-    s = np.clip(u, 0.0, 1.0)
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def _positive(**values: float) -> None:

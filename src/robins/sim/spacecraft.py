@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM
+from robins.errors import require
 from robins.filters.belief import Number
 from robins.linalg import scalars as u
 from robins.rotation import conjugate, rotate
@@ -115,8 +116,7 @@ def _inertia(inertia_b: Number) -> np.ndarray:
         raise ValueError(f"inertia_b must be symmetric, got\n{J}")
     J = 0.5 * (J + J.T)
     low, middle, high = moments = np.linalg.eigvalsh(J)
-    if low <= 0.0:
-        raise ValueError(f"inertia_b must be positive definite; its principal moments: {moments}")
+    require(low > 0.0, f"inertia_b must be positive definite; its principal moments: {moments}")
     if low + middle < high * (1.0 - 1e-12):
         raise ValueError(
             f"inertia_b has principal moments {moments}: in a rigid body none is greater than the "

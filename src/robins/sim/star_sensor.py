@@ -16,7 +16,6 @@ Aberration, motion blur of a long exposure and merging double stars are not simu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +26,7 @@ from jaxtyping import Array, Float, Int
 from robins import _float64  # noqa: F401
 from robins.earth.stars import StarIndex, Stars, index_stars, near
 from robins.filters.belief import Number
+from robins.filters.values import kind, value
 from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
 from robins.manifold import wrap
@@ -101,8 +101,7 @@ def read_star(
     return normalise(multiply(q_ib, from_rotvec(error)))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class StarCamera:
     """A camera that reports directions of stars; boresight z.
 
@@ -120,9 +119,9 @@ class StarCamera:
     missed: Any = 0.0  # probability that a star in the field is not reported
     q_bs: Any = (1.0, 0.0, 0.0, 0.0)  # sensor axes to body axes
     # greatest number of stars reported, the brightest
-    most_stars: int = field(default=40, metadata={"static": True})
+    most_stars: int = kind(default=40)
     # directions without a star, anywhere in the field
-    false_stars: int = field(default=0, metadata={"static": True})
+    false_stars: int = kind(default=0)
 
 
 class StarImage(NamedTuple):

@@ -254,6 +254,16 @@ def _vector_part(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return p[:, :1] * b - q[:, :1] * a - np.cross(a, b)
 
 
+def knots_of(duration_s: float, knots_hz: float) -> np.ndarray:
+    """Times [s] of the knots of a spline from 0 to a duration, eight intervals at least."""
+    return np.linspace(0.0, duration_s, max(int(np.ceil(duration_s * knots_hz)), 8) + 1)
+
+
+def smooth(s: np.ndarray) -> np.ndarray:
+    """Rise from 0 to 1 over s in [0, 1] with two continuous derivatives."""
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
 def _radii(lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     w_sq = 1.0 - E2 * np.sin(lat) ** 2
     transverse = A_M / np.sqrt(w_sq)
@@ -290,8 +300,7 @@ def at_lever_arm(
         raise ValueError(f"lever_b_m must be three finite numbers, got {lever_b_m}")
     if not np.any(lever):
         return motion
-    count = max(int(np.ceil(motion.duration_s * knots_hz)), 8)
-    t = np.linspace(0.0, motion.duration_s, count + 1)
+    t = knots_of(motion.duration_s, knots_hz)
     k = motion.at(t)
     lat, lon, alt, q_nb = _carried(k.lat, k.lon, k.alt, k.q_nb, lever)
     return from_waypoints(t, *(np.asarray(a) for a in (lat, lon, alt)), q_nb=np.asarray(q_nb))

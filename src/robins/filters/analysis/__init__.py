@@ -26,7 +26,6 @@ from robins.filters.analysis.observability import (
     worded,
 )
 from robins.filters.analysis.worst_case import (
-    existence_margin,
     gamma_min,
     steady_h_infinity,
     steady_kalman,
@@ -40,7 +39,6 @@ __all__ = [
     "bits",
     "bound_along",
     "covariance_bound",
-    "existence_margin",
     "gamma_min",
     "gramian",
     "grand_mean_nis",

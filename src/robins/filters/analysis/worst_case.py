@@ -18,13 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.analysis.bound import delayed_by_one
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import matrix, positive, square
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
@@ -33,27 +32,6 @@ from robins.filters.rules._inflation import Weight, as_weight, rows_of
 from robins.filters.rules.h_infinity import Estimate, HInfinity, h_infinity, least_gamma
 from robins.filters.run import Solution, Step, run
 from robins.manifold import State
-
-
-def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Array, ""]:
-    """Least eigenvalue of ``P^-1 - gamma^-2 L'L``: positive where an H-infinity filter exists.
-
-    P is the covariance after the measurement; the result has the units of P^-1 and is NaN where P
-    is singular. Batch with `jax.vmap`. `weight` is L as `h_infinity` takes it.
-
-    Raises:
-        TypeError: gamma is not one real number.
-        ValueError: gamma is not positive (not checked in compiled code), or L has not n columns.
-    """
-    if not isinstance(gamma, Tracer):
-        positive("gamma", gamma, "the Kalman filter")
-    name = "existence_margin"
-    L = rows_of(as_weight(weight, name), belief.mean, name) / jnp.asarray(gamma, float)
-    n = belief.factor.shape[0]
-    if L.shape[1] != n:
-        raise ValueError(f"{name}: weight has {L.shape[1]} columns, the state has {n} components")
-    root = linalg.solve_lower(belief.factor, jnp.eye(n))
-    return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
 
 
 def gamma_min(

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.kalman import Advanced, Again, Around, Filter, FilterState, Updated
 from robins.filters.model import Data, Motion, Sensor
@@ -115,8 +116,7 @@ def adjusted(state: FilterState, numbers: Mapping[str, ArrayLike]) -> FilterStat
     """
     held = state.memory.numbers
     for name, given in numbers.items():
-        if name not in held:
-            raise ValueError(f"no number '{name}' in this state; it has {sorted(held)}")
+        require(name in held, f"no number '{name}' in this state; it has {sorted(held)}")
         found = jnp.asarray(number(f"{name} must be real", given), float)
         if found.shape not in ((), held[name].shape):
             raise ValueError(f"{name} has shape {held[name].shape}, got {found.shape}")

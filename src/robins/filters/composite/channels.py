@@ -160,7 +160,7 @@ class JoinedFilter(Composite):
     def filters(self) -> tuple[Filter, ...]:
         return tuple(one.filter for one in self.channels)
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
+    def with_filters(self, filters: tuple[Filter, ...]) -> JoinedFilter:
         each = zip(self.channels, filters, strict=False)  # a master has no channel
         return replace(self, channels=tuple(replace(c, filter=f) for c, f in each))
 
@@ -335,12 +335,7 @@ class AtMaster(Composite):
     master: Filter
     sensors: tuple[str, ...] = kind()
 
-    @property
-    def filters(self) -> tuple[Filter, ...]:
-        return self.joined, self.master
-
-    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
-        return replace(self, joined=filters[0], master=filters[1])
+    held = ("joined", "master")
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
         return state.memory

@@ -128,7 +128,7 @@ class Delayed(Around):
             log_likelihood=jnp.zeros(asked.shape),
         )
         zero = jnp.zeros((), int)
-        return _outer(inner, DelayMemory(inner.memory, past, zero, zero, known))
+        return inner._replace(memory=DelayMemory(inner.memory, past, zero, zero, known))
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         return self.begin(self.inner.init(belief, dims), _numbers(self.model))
@@ -151,7 +151,7 @@ class Delayed(Around):
         inner, prediction = self.inner.predict(inner, motion, u)
         reach = jnp.minimum(held.reach + 1, self.depth)
         known = Model(_numbers(motion), held.model.sensors)
-        new = _outer(inner, DelayMemory(inner.memory, past, now, reach, known))
+        new = inner._replace(memory=DelayMemory(inner.memory, past, now, reach, known))
         return new, prediction._replace(transition=None, origin=None)
 
     def opened(self, past: _StepBuffer, at: Array, inner: FilterState, u: Data) -> _StepBuffer:
@@ -183,7 +183,8 @@ class Delayed(Around):
         told = _update_info(past, place, redone)
         inner = redone.inner
         past = past._replace(before=redone.before, log_likelihood=redone.log_likelihood)
-        return _outer(inner, DelayMemory(inner.memory, past, held.now, held.reach, known)), told
+        kept = DelayMemory(inner.memory, past, held.now, held.reach, known)
+        return inner._replace(memory=kept), told
 
     def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
         """Index of a sensor, and the model with the numbers of that sensor.
@@ -334,10 +335,6 @@ def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> St
 def _inner(state: FilterState) -> FilterState:
     """State of the inner filter."""
     return state._replace(memory=state.memory.inner)
-
-
-def _outer(inner: FilterState, memory: DelayMemory) -> FilterState:
-    return inner._replace(memory=memory)
 
 
 def _numbers(tree: T) -> T:

@@ -41,14 +41,14 @@ state of the same index. D, the standard deviations of the belief, makes the sta
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
@@ -64,7 +64,7 @@ from robins.filters.composite.channels import (
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Data, Model, Motion
+from robins.filters.model import Data, Given, Model, Motion
 from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.manifold import State
 
@@ -112,7 +112,7 @@ def observability_shares(
     channels: Sequence[Channel],
     steps: int | None = None,
     u: Data = None,
-    aux: dict[str, Any] | None = None,
+    aux: Mapping[str, Data] | None = None,
 ) -> np.ndarray:
     """(N, n) shares by the observability of each state in each channel; computed before a run.
 
@@ -200,7 +200,7 @@ class Federated(JoinedFilter):
     def filters(self) -> tuple[Filter, ...]:
         return (*super().filters, self.centre) if self.has_master else super().filters
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
+    def with_filters(self, filters: tuple[Filter, ...]) -> JoinedFilter:
         centre = filters[-1] if self.has_master else self.centre
         return replace(super().with_filters(filters), centre=centre)
 
@@ -298,7 +298,7 @@ def federated(
     channels: Sequence[Channel],
     mode: Mode = "fusion-reset",
     sharing: Sharing = "root",
-    shares: str | ArrayLike | Sequence[Any] = "equal",
+    shares: str | Given = "equal",
     master: Number = 0.0,
     *,
     keep: Number = 0.5,
@@ -398,7 +398,7 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
     return composed_motion(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
 
 
-def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
+def _has_master(mode: str, shares: str | Given, master: Numbers) -> bool:
     """True if there is a master; refuse one, or shares, that the mode excludes."""
     some = not is_known(master) or bool(master > 0.0)
     if mode == "rescale" and not some:
@@ -411,7 +411,7 @@ def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
     return some or mode == "zero-reset"
 
 
-def _fixed_shares(shares: Any, count: int, master: Numbers) -> Numbers | None:
+def _fixed_shares(shares: str | Given, count: int, master: Numbers) -> Numbers | None:
     """Shares of the channels, scaled to sum to one; None if they are not given as numbers."""
     if isinstance(shares, str):
         if shares == "observability":

@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
+from robins.filters.model import Given
 from robins.filters.values import is_known
 
 Sharing = Literal["scalar", "root", "half"]
@@ -146,9 +147,7 @@ def _summed(
 # ------------------------------------------------------------------------------------------ share
 
 
-def share(
-    belief: Belief, shares: ArrayLike | Sequence[Any], sharing: Sharing = "root"
-) -> tuple[Belief, ...]:
+def share(belief: Belief, shares: Given, sharing: Sharing = "root") -> tuple[Belief, ...]:
     """Divide a belief into N with the same mean, each with its share of the information.
 
     Args:
@@ -303,7 +302,7 @@ def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
     return jax.lax.scan(lambda w, b: (newton(w, b), None), jnp.full(count, 1.0 / count), steps)[0]
 
 
-def check_criterion(criterion: Any, count: int) -> None:
+def check_criterion(criterion: str | Given, count: int) -> None:
     """Refuse an unknown criterion, or weights that are negative or do not sum to one."""
     if isinstance(criterion, str):
         if criterion not in _SLOPES:

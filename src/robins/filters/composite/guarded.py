@@ -35,7 +35,6 @@ evidence for that is summed as in Page's test (1954) for the quickest detection 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -108,15 +107,10 @@ class Guarded(Composite):
     groups: tuple[tuple[int, ...], ...] | None = kind()
     trusted: bool = kind()
 
-    @property
-    def filters(self) -> tuple[Filter, ...]:
-        return self.filter, self.reference
-
-    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
-        return replace(self, filter=filters[0], reference=filters[1])
+    held = ("filter", "reference")
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
-        return state.memory.filter, state.memory.reference
+        return state.memory[:2]
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         if unknown := [name for name in (*self.assumed, *self.judging) if name not in dims]:

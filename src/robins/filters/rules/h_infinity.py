@@ -18,7 +18,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.kalman import Filter
 from robins.filters.linearise import Transition
-from robins.filters.model import Given
+from robins.filters.model import Data, Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Again, Rule
 from robins.filters.rules import _inflation
@@ -351,7 +351,7 @@ def with_gamma(filter_: F, gamma: Given) -> F:
     """
     inverse = 1.0 / _as_gamma(gamma)
 
-    def is_rule(part: object) -> bool:
+    def is_rule(part: Data) -> bool:
         return isinstance(part, HInfinity)
 
     parts, structure = jax.tree_util.tree_flatten(filter_, is_leaf=is_rule)

@@ -14,7 +14,7 @@ import numpy as np
 from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.walk import JaxprWriter, Nodes, rule
+from robins.program.walk import JaxprWriter, Nodes, flat, rule, shaped
 
 
 def per_matrix(
@@ -35,12 +35,8 @@ def call(
     shapes: Sequence[tuple[int, ...]],
 ) -> list[Nodes]:
     """Call a routine on arrays, one after the other, and split its results likewise."""
-    counts = [int(np.prod(shape)) for shape in shapes]
-    args = [n for a in arrays for n in a.ravel().tolist()]
-    found = walk.graph.block(routine, sizes, args, sum(counts))
-    ends = np.cumsum(counts)[:-1]
-    parts = np.split(np.array(found, dtype=np.int64), ends)
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+    count = sum(int(np.prod(shape)) for shape in shapes)
+    return shaped(walk.graph.block(routine, sizes, flat(arrays), count), shapes)
 
 
 def dot(walk: JaxprWriter, a: list[Node], b: list[Node]) -> Node:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from jax.extend import core as jex
 from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
-from robins.program.walk import JaxprWriter, Nodes, rule
+from robins.program.walk import JaxprWriter, Nodes, flat, rule, shaped
 
 LONGEST = 100_000  # most rounds of a loop that are written out
 
@@ -73,19 +73,6 @@ def _cond(walk: JaxprWriter, equation: Equation, index: Nodes, *args: Nodes) -> 
     ]
 
 
-def _flat(arrays: Iterable[Nodes]) -> list[Node]:
-    return [n for a in arrays for n in a.ravel().tolist()]
-
-
-def _shaped(nodes: list[Node], like: Iterable[Nodes]) -> list[Nodes]:
-    """Split a list of nodes into arrays of the shapes of others."""
-    out, at = [], 0
-    for a in like:
-        out.append(np.array(nodes[at : at + a.size], dtype=np.int64).reshape(a.shape))
-        at += a.size
-    return out
-
-
 def _converted(walk: JaxprWriter, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
     """Carried arrays after a round, converted to the kinds before it."""
     graph = walk.graph
@@ -144,19 +131,19 @@ def _rolled(
 ) -> list[Nodes]:
     """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
     graph, length = walk.graph, len(order)
-    loop = graph.open(_flat(carry), length)
+    loop = graph.open(flat(carry), length)
 
     def row(a: Nodes) -> Nodes:
         columns = map(np.asarray, a[:: order.step])
         return walk.each(lambda *nodes: graph.pick(nodes, loop.index), *columns)
 
-    now = _shaped(loop.leaves, carry)
+    now = shaped(loop.leaves, [a.shape for a in carry])
     found = walk.closed(body, *consts, *now, *map(row, rows))
     new, kept = found[: len(carry)], found[len(carry) :]
-    loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
+    loop.next, loop.kept = flat(_converted(walk, new, now)), flat(kept)
     loop.sizes = [a.size for a in kept]
     after, rounds = graph.close(loop)
-    out, at = _shaped(after, carry), 0
+    out, at = shaped(after, [a.shape for a in carry]), 0
     for a in kept:
         columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
         out.append(columns.T.reshape(length, *a.shape)[:: order.step])
@@ -195,12 +182,12 @@ def _while(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
             return carry
         carry = round_of(going, carry)
         written += size_of(p["body_jaxpr"].jaxpr)
-    loop = graph.open(_flat(begin), None)
-    now = _shaped(loop.leaves, begin)
+    loop = graph.open(flat(begin), None)
+    now = shaped(loop.leaves, [a.shape for a in begin])
     going = walk.closed(p["cond_jaxpr"], *cond_consts, *now)[0]
     loop.condition = fold(walk, "or", False, going, tuple(range(going.ndim)), "flag").item()
-    loop.next = _flat(round_of(going, now))
-    return _shaped(graph.close(loop)[0], begin)
+    loop.next = flat(round_of(going, now))
+    return shaped(graph.close(loop)[0], [a.shape for a in begin])
 
 
 FREE = {
