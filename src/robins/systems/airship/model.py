@@ -124,7 +124,8 @@ def with_wind(base: Motion, wind: _WindError) -> Motion:
 
         w' = e^(-dt/tau) w + v,   E v v' = sigma^2 (1 - e^(-2 dt/tau)) I.
     """
-    return Motion(*(Partial(f, base, wind) for f in (_step_wind, _noise_wind, _linear_wind)))
+    moves, noise, linear = (Partial(f, base, wind) for f in (_step_wind, _noise_wind, _linear_wind))
+    return Motion(moves, noise, linear)
 
 
 def _wind_step(wind: _WindError, block: Increments) -> tuple[Array, Array]:
