@@ -17,7 +17,7 @@ from robins.filters import Belief
 from robins.report.sensitivity import budget, scatter, table
 from robins.systems import Case
 from robins.systems.ins_gnss.model import POSITION, Fix
-from robins.systems.ins_gnss.world import DriveBelief, as_believed
+from robins.systems.ins_gnss.world import as_believed
 from robins.workbench import publish, run
 from robins.workbench.scenarios import read_scenario
 from robins.workbench.sensitivity import UncertainParameter, sensitivity, uncertain
@@ -158,7 +158,7 @@ def test_worlds_take_numbers_that_are_traced(name):
 
 
 def test_a_filter_of_a_drive_is_told_what_the_scenario_says():
-    told = DriveBelief(jnp.eye(2), {POSITION: jnp.array([1.0, 1.0, 2.0])})
+    told = jnp.eye(2), {POSITION: jnp.array([1.0, 1.0, 2.0])}
     drawn = Fix(jnp.full((4, 3), 9.0), jnp.ones((4, 3)))
     start = Belief(jnp.arange(2.0), 7.0 * jnp.eye(2))
     case = as_believed(told, Case(start, None, {}, {POSITION: drawn}, None))

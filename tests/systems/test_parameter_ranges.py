@@ -14,9 +14,7 @@ from robins import scenario, units
 from robins.bench.run import setup
 from robins.scenario import Parameters, Quantity, ScenarioError
 from robins.systems import SYSTEMS
-from robins.systems.gnss.parameters import City
-from robins.systems.gnss.world import motion_of as city_motion_of
-from robins.systems.ins_gnss.world import motion_of
+from robins.systems.parts import motion_of
 from robins.systems.transfer_alignment.product.world import motion_of as pair_motion_of
 
 DRIVE = SYSTEMS["ins-gnss"].scenarios["drive"]
@@ -163,8 +161,7 @@ def test_packaged_scenarios_are_within_and_none_may_last_a_year(parameters, path
     # what the legs are said to last is what their motion does
     if hasattr(given, "legs"):
         lasts = sum(leg.lasts_s for leg in given.legs)
-        of = city_motion_of if isinstance(given, City) else motion_of
-        assert of(given).duration_s == pytest.approx(lasts, rel=1e-12)
+        assert motion_of(given.place, given.legs).duration_s == pytest.approx(lasts, rel=1e-12)
     elif hasattr(given, "slave") and hasattr(given.manoeuvre, "kind"):
         lasts = given.manoeuvre.lasts_s
         assert pair_motion_of(given.manoeuvre).duration_s == pytest.approx(lasts, rel=1e-9)

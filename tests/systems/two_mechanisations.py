@@ -238,8 +238,8 @@ def slipped_rate(x, sins, errors, slips):
     with small:
         rate = error_model.error_rate(x, sins, errors)
     dv, lat, alt = x[3:6], x[error_model.LAT], x[error_model.ALT]
-    here = error_model.surroundings(sins.lat, sins.alt, sins.v_n).coriolis
-    true = error_model.surroundings(sins.lat - lat, sins.alt - alt, sins.v_n - dv).coriolis
+    here = error_model.surroundings(sins.lat, sins.alt, sins.v_n)[1]
+    true = error_model.surroundings(sins.lat - lat, sins.alt - alt, sins.v_n - dv)[1]
     if "last-cross-term" in slips:
         rate = rate.at[3:6].add(jnp.cross(2.0 * true - here, dv))
     if "omitted-cross-term" in slips:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -60,6 +61,21 @@ def transition(
     scale = jnp.stack([one, wn])
     L = sigma * scale[:, None] * linalg.cholesky(Q)
     return Phi * scale[:, None] / scale[None], L
+
+
+def swing(flexure: Flexure, dt_s: ArrayLike) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
+    """Exact step of the angles and then the rates of all axes: Phi and the factor L of Q = L L'."""
+    given = (flexure.sigma_rad, flexure.tau_s, flexure.damping)
+    three = [jnp.broadcast_to(jnp.asarray(x, float), 3) for x in given]
+    axes = jax.vmap(partial(transition, dt_s=dt_s))(*three)
+    Phi, L = (jnp.einsum("aij,ab->iajb", x, jnp.eye(3)).reshape(6, 6) for x in axes)
+    return Phi, L
+
+
+def stationary_sigma(flexure: Flexure) -> np.ndarray:
+    """Standard deviations (6,) of the angles and then the rates, without correlations."""
+    sigma, tau = (np.asarray(x, float) for x in (flexure.sigma_rad, flexure.tau_s))
+    return np.concatenate([sigma, sigma * _WN_TAU / tau])
 
 
 def simulate_flexure(

@@ -13,14 +13,24 @@ import pydantic
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, PyTree
 
-from robins.filters import Motion
+from robins.earth import Geodetic
+from robins.filters import Motion, Sensor
 from robins.filters.belief import Number
 from robins.filters.values import Numbers
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim import _given
 from robins.sim._given import Listed
-from robins.sim.commands import Manoeuvre, accelerate, climb, stop, straight, turn
+from robins.sim.commands import (
+    Manoeuvre,
+    accelerate,
+    climb,
+    from_commands,
+    stop,
+    straight,
+    turn,
+)
+from robins.sim.trajectory import MotionProfile
 from robins.systems import quantities as q
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -40,6 +50,10 @@ HowMany = Annotated[RunNumber, pydantic.BeforeValidator(lambda x: MOST_RUNS if x
 
 Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 """Names of filters, at least one."""
+
+
+NoiseOf = ArrayLike | Callable[..., Array]
+"""Standard deviations or factor of a noise, or a function of state and data that gives them."""
 
 
 class StartPlace(Parameters):
@@ -151,6 +165,16 @@ class Leg(Parameters):
         return make(*(getattr(self, name) for name in needed))
 
 
+def motion_of(place: Departure, legs: Sequence[Leg], speed: float = 0.0) -> MotionProfile:
+    """The motion that legs describe, from rest or from a speed [m/s].
+
+    Raises:
+        ValueError: a leg is not complete.
+    """
+    start = Geodetic(place.latitude, place.longitude, place.height)
+    return from_commands(start, [leg.command() for leg in legs], place.heading, speed)
+
+
 # parameters of each leg, in the order its command takes them
 _COMMANDS: dict[str, tuple[Callable[..., Manoeuvre], tuple[str, ...]]] = {
     "stop": (stop, ("seconds",)),
@@ -168,15 +192,30 @@ class ImuBlock(NamedTuple):
     noise_scale: ArrayLike  # () multiplier of the process noise factor: 1, larger across an IMU gap
 
 
-def noise_of_linear(linear: Callable[..., tuple], x: PyTree, u: PyTree) -> Array:
-    """Process noise factor of a step, the third output of the linear form of its motion."""
+def _first(linear: Callable[..., tuple], x: PyTree, u: PyTree) -> PyTree:
+    return linear(x, u)[0]
+
+
+def _third(linear: Callable[..., tuple], x: PyTree, u: PyTree) -> Array:
     return linear(x, u)[2]
 
 
-def moved_by(step: Callable[..., PyTree], linear: Callable[..., tuple], *given: PyTree) -> Motion:
-    """Motion with this step and linear form, both called with `given` before state and input."""
+def moved_by(
+    step: Callable[..., PyTree] | None, linear: Callable[..., tuple], *given: PyTree
+) -> Motion:
+    """Motion with this step and linear form, both called with `given` before state and input.
+
+    The process noise is that of the linear form, and so is the step if it is None.
+    """
     slope = Partial(linear, *given)
-    return Motion(Partial(step, *given), Partial(noise_of_linear, slope), slope)
+    moved = Partial(_first, slope) if step is None else Partial(step, *given)
+    return Motion(moved, Partial(_third, slope), slope)
+
+
+def seen_by(linear: Callable[..., tuple], noise: NoiseOf, dim: int, name: str) -> Sensor:
+    """Sensor whose reading is the first output of its linear form."""
+    slope = Partial(linear)
+    return Sensor(Partial(_first, slope), noise, dim, name, slope)
 
 
 LARGEST_RAD = np.radians(5.0)  # largest error for which a linear model holds

@@ -134,12 +134,13 @@ def error_rate(
 
     here = surroundings(sins.lat, sins.alt, v)
     true = surroundings(sins.lat - x[LAT], sins.alt - x[ALT], v - dv)
-    d = EarthRates(*(a - b for a, b in zip(here, true, strict=True)))
+    omega_in, coriolis, *_ = here
+    d_omega_in, d_coriolis, d_gravity, d_lonlat = (a - b for a, b in zip(here, true, strict=True))
 
-    w_nc = (jnp.eye(3) - C_cn) @ here.omega_in + C_cn @ d.omega_in - gyro_c
-    dv_rate = f_c - C_cn.T @ (f_c - accel_c) - jnp.cross(d.coriolis, v)
-    dv_rate = dv_rate - jnp.cross(here.coriolis, dv) + d.gravity + jnp.cross(d.coriolis, dv)
-    return jnp.concatenate([rate_matrix_inverse(phi) @ w_nc, dv_rate, d.lonlat_rate, dv[2:]])
+    w_nc = (jnp.eye(3) - C_cn) @ omega_in + C_cn @ d_omega_in - gyro_c
+    dv_rate = f_c - C_cn.T @ (f_c - accel_c) - jnp.cross(d_coriolis, v)
+    dv_rate = dv_rate - jnp.cross(coriolis, dv) + d_gravity + jnp.cross(d_coriolis, dv)
+    return jnp.concatenate([rate_matrix_inverse(phi) @ w_nc, dv_rate, d_lonlat, dv[2:]])
 
 
 def step(
@@ -231,7 +232,7 @@ class CorrectedSins:
 
 
 def _motion(given: Airship, course: AirshipCourse) -> Motion:
-    """Motion of a `CorrectedSins`; input of a step: one increment. Needs the rule `feedback`."""
+    """Motion of a `CorrectedSins`; input of a step: one increment. Needs the rule `Feedback`."""
     return Motion(_step, Partial(_noise, believed_noise(given), course.datum.metres))
 
 
@@ -259,18 +260,13 @@ def _noise(
 
 @value
 class Feedback(Rule):
-    """The rule of `feedback`."""
+    """Correct the SINS by its estimated errors, once a step after all its measurements."""
 
     name = "feedback"
 
     def settle(self, memory: Memory, belief: Belief):
         nav = belief.mean.nav
         return memory, Belief(CorrectedSins(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
-
-
-def feedback() -> Rule:
-    """Correct the SINS by its estimated errors, once a step after all its measurements."""
-    return Feedback()
 
 
 def _start_sigma(given: Airship, course: AirshipCourse) -> list[Numbers]:
@@ -293,27 +289,18 @@ ERRORS = States(
 )
 
 
-class EarthRates(NamedTuple):
-    """Quantities that depend on position and velocity; ENU."""
+def surroundings(lat: Array, alt: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+    """Rates and gravity at a position and velocity, ENU.
 
-    omega_in: Array  # rad/s, w_ie + w_en
-    coriolis: Array  # rad/s, 2 w_ie + w_en
-    gravity: Array  # m/s^2
-    lonlat_rate: Array  # rad/s
-
-
-def surroundings(lat: Array, alt: Array, v: Array) -> EarthRates:
-    """Frame rates, gravity, longitude and latitude rates at a position and velocity (ENU)."""
+    They are w_ie + w_en and 2 w_ie + w_en [rad/s], gravity [m/s^2], and the rates of longitude and
+    latitude [rad/s].
+    """
     omega_ie = swap(earth_rate_n(lat))
     omega_en = swap(transport_rate_n(lat, alt, swap(v)))
     meridian, transverse = curvature_radii(lat)
     lonlat_rate = [v[0] / ((transverse + alt) * jnp.cos(lat)), v[1] / (meridian + alt)]
-    return EarthRates(
-        omega_ie + omega_en,
-        2.0 * omega_ie + omega_en,
-        swap(gravity_n(lat, alt)),
-        jnp.stack(lonlat_rate),
-    )
+    gravity = swap(gravity_n(lat, alt))
+    return omega_ie + omega_en, 2.0 * omega_ie + omega_en, gravity, jnp.stack(lonlat_rate)
 
 
 def _swap_dcm(C):

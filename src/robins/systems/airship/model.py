@@ -45,9 +45,10 @@ from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, step
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
+from robins.linalg import block_diagonal
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import AirshipCourse, start_sigma
-from robins.systems.parts import noise_of_linear
+from robins.systems.parts import moved_by
 
 
 class WithWind(NamedTuple):
@@ -62,11 +63,8 @@ class WithWind(NamedTuple):
         return navigation(self.base)
 
 
-class WindNoise(NamedTuple):
-    """First-order Gauss-Markov error of the wind."""
-
-    sigma: Array  # () m/s, each axis
-    time_s: Array  # ()
+_WindError = tuple[Array, Array]
+"""Sigma () [m/s] on each axis and time constant () [s] of a first-order Gauss-Markov process."""
 
 
 def navigation(x: Any) -> Nav:
@@ -108,55 +106,51 @@ def _linear(noise: InsNoise, x: Nav, block: Increments):
 
 def with_biases(noise: InsNoise) -> Motion:
     """Motion of an `InsState`; input of a step: K increments."""
-    linear = Partial(_linear_ins, noise)
-    return Motion(Partial(propagate, noise=noise), Partial(noise_of_linear, linear), linear)
+    return moved_by(_step_ins, _linear_ins, noise)
+
+
+def _step_ins(noise: InsNoise, x: InsState, block: Increments) -> InsState:
+    return propagate(x, block, noise)
 
 
 def _linear_ins(noise: InsNoise, x: InsState, block: Increments):
     return propagate_linear(x, block, noise, segments=1)
 
 
-def with_wind(base: Motion, wind: WindNoise) -> Motion:
+def with_wind(base: Motion, wind: _WindError) -> Motion:
     """A motion with two more states, `WithWind`.
 
     The error of the wind is a stationary Gauss-Markov process: over a step of dt
 
         w' = e^(-dt/tau) w + v,   E v v' = sigma^2 (1 - e^(-2 dt/tau)) I.
     """
-    return Motion(
-        step=Partial(_step_wind, base, wind),
-        noise=Partial(_noise_wind, base, wind),
-        linear=Partial(_linear_wind, base, wind),
-    )
+    moves, noise, linear = (Partial(f, base, wind) for f in (_step_wind, _noise_wind, _linear_wind))
+    return Motion(moves, noise, linear)
 
 
-def _wind_step(wind: WindNoise, block: Increments) -> tuple[Array, Array]:
+def _wind_step(wind: _WindError, block: Increments) -> tuple[Array, Array]:
     """Decay and driving sigma over a step."""
-    ratio = jnp.sum(jnp.asarray(block.dt)) / wind.time_s
-    return jnp.exp(-ratio), wind.sigma * jnp.sqrt(-jnp.expm1(-2.0 * ratio))
+    sigma, time_s = wind
+    ratio = jnp.sum(jnp.asarray(block.dt)) / time_s
+    return jnp.exp(-ratio), sigma * jnp.sqrt(-jnp.expm1(-2.0 * ratio))
 
 
-def _step_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments) -> WithWind:
+def _step_wind(base: Motion, wind: _WindError, x: WithWind, block: Increments) -> WithWind:
     decay, _ = _wind_step(wind, block)
     return WithWind(base.step(x.base, block), decay * x.wind_error)
 
 
-def _noise_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments) -> Array:
+def _noise_wind(base: Motion, wind: _WindError, x: WithWind, block: Increments) -> Array:
     _, drive = _wind_step(wind, block)
-    return _diagonal(base.noise(x.base, block), drive * jnp.eye(2))
+    return block_diagonal(base.noise(x.base, block), drive * jnp.eye(2))
 
 
-def _linear_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments):
+def _linear_wind(base: Motion, wind: _WindError, x: WithWind, block: Increments):
     assert base.linear is not None
     new, Phi, L = base.linear(x.base, block)
     (decay, drive), eye = _wind_step(wind, block), jnp.eye(2)
     new = WithWind(new, decay * x.wind_error)
-    return new, _diagonal(Phi, decay * eye), _diagonal(L, drive * eye)
-
-
-def _diagonal(a: Array, b: Array) -> Array:
-    corner = jnp.zeros((a.shape[0], b.shape[1]))
-    return jnp.block([[a, corner], [jnp.zeros((b.shape[0], a.shape[1])), b]])
+    return new, block_diagonal(Phi, decay * eye), block_diagonal(L, drive * eye)
 
 
 # ----------------------------------------------------------------------- assumptions of a filter
@@ -182,8 +176,8 @@ def believed_noise(given: Airship) -> InsNoise:
     return InsNoise(jnp.asarray(given.believed.gyro_noise), jnp.asarray(given.believed.accel_noise))
 
 
-def _wind(given: Airship) -> WindNoise:
-    return WindNoise(jnp.asarray(given.air_data.wind_error), jnp.asarray(given.air_data.wind_time))
+def _wind(given: Airship) -> _WindError:
+    return jnp.asarray(given.air_data.wind_error), jnp.asarray(given.air_data.wind_time)
 
 
 def _product_motion(given: Airship, course: AirshipCourse) -> Motion:

@@ -22,7 +22,7 @@ from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
 from robins.manifold import retract
 from robins.systems.aboard import Taken, filter_instruments, taken
 from robins.systems.airship import instruments
-from robins.systems.airship.error_model import ERRORS, feedback
+from robins.systems.airship.error_model import ERRORS, Feedback
 from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
 from robins.systems.airship.model import NINE, PRODUCT, WIND_STATES, States
 from robins.systems.airship.parameters import Airship
@@ -93,11 +93,6 @@ def _product() -> Filter:
     return ekf(rules.only((SAR,), rules.huber(0.999)), rules.only((WIND,), patient))
 
 
-def _adaptive() -> Filter:
-    """The filter "product" for a motion model that may be wrong at unknown times."""
-    return filters.adaptive(parts=DRIVEN)
-
-
 class Candidate(NamedTuple):
     """A filter of the study, with its instruments and states."""
 
@@ -141,13 +136,14 @@ CANDIDATES: dict[str, Candidate] = {
     "cukf-sideslip-gated": Candidate(lambda: _gated(_two(ukf, BOTH), BOTH), SIDESLIP),
     "ukf-printed-h": Candidate(lambda: _two(ekf), PRINTED),
     "centralised": Candidate(ukf, PLAIN),
-    "centralised-errors": Candidate(lambda: ukf(feedback()), PLAIN, ERRORS),
+    "centralised-errors": Candidate(lambda: ukf(Feedback()), PLAIN, ERRORS),
     "federated": Candidate(lambda: filters.federated(_locals(ukf), linearise=POINTS), PLAIN),
     "intersection": Candidate(lambda: filters.intersecting(_locals(ukf), "det"), PLAIN),
     "distributed-mean": Candidate(lambda: _two(ukf, feedback="mean"), PLAIN),
     "distributed-full": Candidate(lambda: _two(ukf, feedback="full"), PLAIN),
     "product": Candidate(_product, instruments.ABOARD, PRODUCT),
-    "adaptive": Candidate(_adaptive, instruments.ABOARD, PRODUCT),
+    # "product" for a motion model that may be wrong at unknown times
+    "adaptive": Candidate(lambda: filters.adaptive(parts=DRIVEN), instruments.ABOARD, PRODUCT),
 }
 """Every filter of the study."""
 

@@ -20,9 +20,7 @@ from jaxtyping import Array
 
 from robins import rotation
 from robins.earth import Geodetic
-from robins.sim.commands import from_commands
 from robins.sim.random import Component, gauss_markov, stream
-from robins.sim.trajectory import MotionProfile
 from robins.systems.gnss.filters import GnssWorld
 from robins.systems.gnss.model import (
     LENGTH,
@@ -37,6 +35,7 @@ from robins.systems.gnss.model import (
     pseudoranges,
 )
 from robins.systems.gnss.parameters import City, GnssAssumptions
+from robins.systems.parts import motion_of
 
 _ORBIT_M = 26.56e6  # radius of a GPS orbit
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
@@ -61,24 +60,13 @@ class GnssCourse(NamedTuple):
     way_m: np.ndarray  # (E,) distance along the road
 
 
-def motion_of(city: City) -> MotionProfile:
-    """The motion that the legs describe, from rest.
-
-    Raises:
-        ValueError: a leg is not complete.
-    """
-    p = city.place
-    start = Geodetic(p.latitude, p.longitude, p.height)
-    return from_commands(start, [leg.command() for leg in city.legs], heading_rad=p.heading)
-
-
 def lay_out(city: City) -> GnssCourse:
     """Compute all that does not depend on the run.
 
     Raises:
         ValueError: a leg is not complete.
     """
-    motion = motion_of(city)
+    motion = motion_of(city.place, city.legs)
     time_s = motion.times_ns(city.rate) * 1e-9
     k = motion.at(time_s)
     place = LocalFrame.at(motion.start.as_ecef())

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,26 +112,22 @@ def prepare(whole: Log, parameters: InsGnssReplay, rows: slice) -> LogSegment:
     # uneven: a live filter does not know in advance when the next fix comes
     longest_s = parameters.update.longest_block
     epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
-    steps = steps_of(log, used, begin_s, epochs, parameters, usual)
+    u, y, aux, rate_b = steps_of(log, used, begin_s, epochs, parameters, usual)
     return LogSegment(
-        world=Case(first_belief(log, start, parameters), steps.u, steps.y, steps.aux, None),
+        world=Case(first_belief(log, start, parameters), u, y, aux, None),
         begin_s=begin_s,
         epoch_s=epochs,
-        noise_scale=np.asarray(steps.u.noise_scale),
+        noise_scale=np.asarray(u.noise_scale),
         start=start,
-        rate_b=steps.rate_b,
+        rate_b=rate_b,
         used=used,
         withheld=parameters.withheld(epochs, log.gnss_s),
     )
 
 
-class InsGnssSteps(NamedTuple):
-    """Steps of a filter; leading axis E epochs."""
-
-    u: ImuBlock
-    y: dict[str, Any]
-    aux: dict[str, Any]
-    rate_b: np.ndarray  # (E, 3) rad/s, mean raw gyro rate about each epoch
+InsGnssSteps = tuple[ImuBlock, dict[str, Any], dict[str, Any], np.ndarray]
+"""Inputs, measurements and aux of the steps of a filter, and the mean raw gyro rate about each
+epoch (E, 3) [rad/s]; leading axis E epochs."""
 
 
 def steps_of(
@@ -160,7 +156,7 @@ def steps_of(
     window_s = p.gnss.velocity_window
     y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
     known, about = measured_rest(log, epochs, rate, p.aids, usual)
-    return InsGnssSteps(u, y | known, aux | about, rate)
+    return u, y | known, aux | about, rate
 
 
 def blocks_of(
@@ -249,7 +245,7 @@ def measured_rest(
     if aids.non_holonomic:
         y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
     about: dict[str, Any] = {model.ROAD: rate} if aids.non_holonomic else {}
-    if log.wheels is not None and len(log.wheels.time_s) > 1:
+    if log.wheels is not None and len(log.wheels[0]) > 1:
         t, speed, sigma = log.wheels
         near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
         received = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])

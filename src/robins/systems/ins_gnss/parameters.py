@@ -27,8 +27,8 @@ class InsGnssImu(Parameters):
     correlation time is given.
     """
 
-    gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")]
-    accel_noise: Annotated[q.Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")]
+    gyro_noise: q.AngleWalks
+    accel_noise: q.AccelWalks
     gyro_bias: q.RateSizes
     accel_bias: q.AccelSizes
     gyro_bias_walk: q.RateWalkSizes
@@ -129,12 +129,8 @@ class InsGnssUpdate(LogPartition):
 class UnknownImu(InsGnssImu):
     """Default for an unknown unit: a consumer-grade MEMS."""
 
-    gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
-        "0.01 deg/s/sqrt(Hz)"
-    )
-    accel_noise: Annotated[q.Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")] = (
-        default("200 ug/sqrt(Hz)")
-    )
+    gyro_noise: q.AngleWalks = default("0.01 deg/s/sqrt(Hz)")
+    accel_noise: q.AccelWalks = default("200 ug/sqrt(Hz)")
     gyro_bias: q.RateSizes = default("0.5 deg/s")
     accel_bias: q.AccelSizes = default("20 mg")
     gyro_bias_walk: q.RateWalkSizes = default("0.002 deg/s/sqrt(s)")

@@ -173,31 +173,16 @@ def _moved(of: FixHypothesis, x: AugmentedInsState) -> AugmentedInsState:
     return x._replace(ins=x.ins._replace(position=place), offset=of.kept * x.offset)
 
 
-def _faded(
-    lasting: Array | None, x: AugmentedInsState, u: ImuBlock
-) -> tuple[AugmentedInsState, Array | None]:
-    """State with z decayed over a step, and the decay factor; None without z."""
-    if lasting is None or x.lasting is None:
-        return x, None
-    left = jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
-    return x._replace(lasting=left * x.lasting), left
-
-
-def _step(
-    motion: Motion, of: FixHypothesis, lasting: Array | None, x: AugmentedInsState, u: ImuBlock
-) -> AugmentedInsState:
-    x, _ = _faded(lasting, _moved(of, x), u)
-    return x._replace(ins=motion.step(x.ins, u))
-
-
 def _step_linear(
     motion: Motion, of: FixHypothesis, lasting: Array | None, x: AugmentedInsState, u: ImuBlock
 ):
     assert motion.linear is not None
-    x, left = _faded(lasting, _moved(of, x), u)
+    x = _moved(of, x)
     ins, Phi, factor = motion.linear(x.ins, u)
     factor = jnp.sqrt(of.scale) * factor
-    if left is not None:
+    if lasting is not None and x.lasting is not None:
+        left = jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
+        x = x._replace(lasting=left * x.lasting)
         Phi = block_diagonal(Phi, left * jnp.eye(3))
         factor = block_diagonal(factor, jnp.sqrt(1.0 - left**2) * jnp.eye(3))
     free = 0 if x.share is None else 1
@@ -214,16 +199,17 @@ def _read(read: Callable, x: AugmentedInsState, aux: PyTree):
     return read(x.ins, aux)
 
 
-def _read_off(read: Callable[..., Geodetic], off: ArrayLike, x: AugmentedInsState, aux: Fix):
-    return read(x.ins, aux).retract(jnp.asarray(off) * x.offset)
-
-
-def _read_correlated(
-    read: Callable[..., Geodetic], off: ArrayLike, lasting: Array, x: AugmentedInsState, fix: Fix
+def _read_off(
+    read: Callable[..., Geodetic],
+    off: ArrayLike,
+    lasting: Array | None,
+    x: AugmentedInsState,
+    fix: Fix,
 ):
-    assert x.lasting is not None
-    error = jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
-    return read(x.ins, fix).retract(jnp.asarray(off) * x.offset + error)
+    error = jnp.asarray(off) * x.offset
+    if lasting is not None and x.lasting is not None:
+        error = error + jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
+    return read(x.ins, fix).retract(error)
 
 
 def _white(sigma: Callable[..., Array], lasting: Array, x: AugmentedInsState, fix: Fix):
@@ -263,19 +249,15 @@ def hypothesis_model(model: Model, of: FixHypothesis, lasting: Array | None = No
     """
 
     def sensor(s: Sensor) -> Sensor:
-        own = as_data(s.read)
-        if s.name == POSITION and lasting is not None:
-            white = Partial(_white, as_data(s.noise), lasting)
-            return Sensor(Partial(_read_correlated, own, of.read, lasting), white, s.dim, s.name)
-        if s.name == POSITION:
-            read = Partial(_read_off, own, of.read)
-        else:
-            read = Partial(_read_share if s.name == VELOCITY else _read, own)
+        read = Partial(_read_share if s.name == VELOCITY else _read, as_data(s.read))
         noise = Partial(_read, as_data(s.noise)) if callable(s.noise) else s.noise
+        if s.name == POSITION:
+            read = Partial(_read_off, as_data(s.read), of.read, lasting)
+            noise = noise if lasting is None else Partial(_white, as_data(s.noise), lasting)
         return Sensor(read, noise, s.dim, s.name)
 
     sensors = tuple(map(sensor, model.sensors))
-    return Model(moved_by(_step, _step_linear, model.motion, of, lasting), sensors)
+    return Model(moved_by(None, _step_linear, model.motion, of, lasting), sensors)
 
 
 def augmented_case(

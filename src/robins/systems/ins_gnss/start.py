@@ -149,15 +149,12 @@ def find_start(
         at, begin_s = 0, begin_s if tilt == start.tilt else float(log.gnss_s[some])
     elif fast is None:
         heading, source = _compass(log, q_nb, begin_s, some, unknown)
-        q_nb = with_heading(q_nb, heading)
-        sentence += f", {source}"
+        q_nb, sentence = with_heading(q_nb, heading), f"{sentence}, {source}"
     else:
         q_nb, at, begin_s = _carried(log, q_nb, at, last, bias), last, float(log.gnss_s[fast])
     if fast is not None and not by_way and g.v_n is not None:
-        north, east = g.v_n[fast, :2].tolist()
-        heading = float(np.arctan2(east, north))
-        q_nb = with_heading(q_nb, heading)
-        sentence += _course(heading, begin_s, float(np.hypot(north, east)), "")
+        q_nb = with_heading(q_nb, float(np.arctan2(g.v_n[fast, 1], g.v_n[fast, 0])))
+        sentence += _course(g.v_n[fast], begin_s, "")
     later = whole[log.gnss_s[whole] >= begin_s - 1e-6]
     if len(later) == 0:
         raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
@@ -240,11 +237,11 @@ def _carried(log: Log, q_nb: np.ndarray, at: int, to: int, bias: np.ndarray) -> 
     return attitudes(q_nb, theta)[-1] if len(theta) else q_nb
 
 
-def _course(heading: float, at_s: float, speed: float, by: str) -> str:
-    """Part of the sentence on a start: heading and source of the course."""
+def _course(v_n: np.ndarray, at_s: float, by: str) -> str:
+    """Part of the sentence on a start: heading and source of the course, a velocity."""
     return (
-        f"; heading {np.degrees(heading) % 360:.1f} deg from the course{by} at {at_s:.1f} s, "
-        f"when the speed reached {speed:.2f} m/s"
+        f"; heading {np.degrees(np.arctan2(v_n[1], v_n[0])) % 360:.1f} deg from the course{by} at "
+        f"{at_s:.1f} s, when the speed reached {np.hypot(v_n[0], v_n[1]):.2f} m/s"
     )
 
 
@@ -291,7 +288,7 @@ def _by_positions(
     heading, sentence = start.heading, level_.sentence
     if by_way:
         heading = float(np.hypot(heading, sigma / speed))
-        sentence += _course(float(np.arctan2(v[1], v[0])), log.gnss_s[fix], speed, " of positions")
+        sentence += _course(v, log.gnss_s[fix], " of positions")
     else:
         sentence += f"; velocity from positions, {speed:.2f} +- {sigma:.2f} m/s"
     # a stated velocity is better than that of a line

@@ -18,13 +18,13 @@ from jaxtyping import Array
 
 from robins.dataset import Dataset
 from robins.earth import Geodetic
+from robins.filters.values import Numbers
 from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise_chunked, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
-from robins.sim.commands import from_commands
 from robins.sim.gnss_sensor import GnssErrorModel, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
@@ -32,7 +32,7 @@ from robins.sim.random import Component, stream
 from robins.sim.trajectory import MotionProfile
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, InsGnssImu
-from robins.systems.parts import ImuBlock, any_there, as_array
+from robins.systems.parts import ImuBlock, any_there, as_array, motion_of
 from robins.systems.study import Case
 
 
@@ -49,17 +49,6 @@ class InsGnssCourse(NamedTuple):
     at_fix: tuple[np.ndarray, ...]  # the truth at each fix: arguments of `observe`
     fix: np.ndarray  # (E,) index of the fix at each epoch, -1 if none
     outage: np.ndarray  # (E,) bool
-
-
-def motion_of(drive: Drive) -> MotionProfile:
-    """The motion that the legs describe, from rest.
-
-    Raises:
-        ValueError: a leg is not complete.
-    """
-    p = drive.place
-    start = Geodetic(p.latitude, p.longitude, p.height)
-    return from_commands(start, [leg.command() for leg in drive.legs], heading_rad=p.heading)
 
 
 def error_model(imu: InsGnssImu) -> ImuErrorModel:
@@ -100,7 +89,7 @@ def lay_out(drive: Drive) -> InsGnssCourse:
     Raises:
         ValueError: the legs are too short for two fixes.
     """
-    motion = motion_of(drive)
+    motion = motion_of(drive.place, drive.legs)
     time_ns = motion.times_ns(drive.imu_rate)
     trajectory = motion.trajectory(time_ns)
     table = ideal_increments(trajectory)
@@ -208,29 +197,27 @@ def simulate(drive: Drive, course: InsGnssCourse, seed: int, index: Array) -> Ca
     return Case(start, u, y, aux, truth)
 
 
-class DriveBelief(NamedTuple):
-    """Initial covariance and measurement sigmas assumed by the filters."""
-
-    factor: Array  # of the initial covariance
-    sigma: dict[str, Any]  # by sensor
+# what filters assume: factor of the initial covariance, and sigmas by sensor
+_Belief = tuple[Numbers, dict[str, Any]]
 
 
-def belief_of(drive: Drive, course: InsGnssCourse) -> DriveBelief:
+def belief_of(drive: Drive, course: InsGnssCourse) -> _Belief:
     """Assumptions of the filters from the parameters."""
     begin = drive.start
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
     r, g = np.sqrt(drive.believed.r_factor), drive.gnss
     sigma = {POSITION: g.sigma} | ({VELOCITY: g.velocity_sigma} if g.use_velocity else {})
-    return DriveBelief(known.factor, {name: r * as_array(each) for name, each in sigma.items()})
+    return known.factor, {name: r * as_array(each) for name, each in sigma.items()}
 
 
-def as_believed(belief: DriveBelief, world: Case) -> Case:
+def as_believed(belief: _Belief, world: Case) -> Case:
     """Case of a drive, with the assumptions of the filters in place of the true sigmas."""
+    factor, sigma = belief
     aux = {
-        name: fix._replace(sigma=jnp.broadcast_to(belief.sigma[name], fix.sigma.shape))
+        name: fix._replace(sigma=jnp.broadcast_to(sigma[name], fix.sigma.shape))
         for name, fix in world.aux.items()
     }
-    return world._replace(start=world.start._replace(factor=belief.factor), aux=aux)
+    return world._replace(start=world.start._replace(factor=factor), aux=aux)
 
 
 def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:
@@ -238,7 +225,7 @@ def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:
 
     Its noise is that of the same run in a campaign.
     """
-    motion = motion_of(drive)
+    motion = motion_of(drive.place, drive.legs)
     truth = motion.trajectory(motion.times_ns(drive.imu_rate), source="simulated drive")
     key = partial(stream, seed, run)
     table = ideal_increments(truth)

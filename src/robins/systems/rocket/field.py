@@ -63,21 +63,11 @@ _LEAST, _MOST = 0.3, 3.0  # plausible magnitudes, relative to the expected field
 
 
 class FieldState(NamedTuple):
-    """Attitude, and the bias [rad/s] of the gyro in body axes."""
+    """Attitude, and errors of the gyro in body axes."""
 
     q_nb: Rotation
-    bias: Any  # (3,)
-
-
-class ScaledState(NamedTuple):
-    """`FieldState` with the scale factor errors of the gyro axes."""
-
-    q_nb: Rotation
-    bias: Any  # (3,)
-    scale: Any  # (3,) relative
-
-
-AnyState = FieldState | ScaledState
+    bias: Any  # (3,) rad/s
+    scale: Any = None  # (3,) relative scale factor errors; None where they are no states
 
 
 class GyroTurn(NamedTuple):
@@ -106,23 +96,23 @@ def field_sensor(sine: Array, name: str = FIELD) -> Sensor:
 
 
 # (B1)
-def propagate(g: GyroNoise, x: AnyState, u: GyroTurn) -> AnyState:
+def propagate(g: GyroNoise, x: FieldState, u: GyroTurn) -> FieldState:
     """Rotate by the reported gyro angle of a step."""
     return x._replace(q_nb=Rotation(normalise(multiply(x.q_nb.wxyz, from_rotvec(_turn(g, x, u))))))
 
 
-def _turn(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
+def _turn(g: GyroNoise, x: FieldState, u: GyroTurn) -> Array:
     """Rotation vector w (3,) [rad] of a step: the reported angle corrected for bias and scale."""
     return (u.theta_b - g.step_s * x.bias) / _stretch(x)
 
 
-def _stretch(x: AnyState) -> Array:
+def _stretch(x: FieldState) -> Array:
     """(3,) 1 + s, which is far from zero for any usable gyro."""
-    return 1.0 + x.scale if isinstance(x, ScaledState) else jnp.ones(3)
+    return jnp.ones(3) if x.scale is None else 1.0 + x.scale
 
 
 # (B2)
-def propagated(g: GyroNoise, x: AnyState, u: GyroTurn):
+def propagated(g: GyroNoise, x: FieldState, u: GyroTurn):
     """`propagate` with its Jacobian and noise."""
     w, gain = _turn(g, x, u), 1.0 / _stretch(x)
     # the rotation of a step is small, but not negligible for a coning body
@@ -134,19 +124,19 @@ def propagated(g: GyroNoise, x: AnyState, u: GyroTurn):
 
 
 # (B3)
-def noise_of(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
+def noise_of(g: GyroNoise, x: FieldState, u: GyroTurn) -> Array:
     """Standard deviations (n,) of a step: equal on all axes, so the same in body and n axes."""
     angle = jnp.sqrt(g.angle**2 + u.doubt**2)
     return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), jnp.zeros(dim(x) - 6)])
 
 
 # (B4)
-def read_field(x: AnyState, field_n: Array) -> Array:
+def read_field(x: FieldState, field_n: Array) -> Array:
     """(3,) field in body axes, in the unit of ``field_n``."""
     return rotate(conjugate(x.q_nb.wxyz), field_n)
 
 
-def observed(x: AnyState, field_n: Array):
+def observed(x: FieldState, field_n: Array):
     """`read_field` with its Jacobian: R(q)' exp(-phi) B = R(q)' (B + B x phi)."""
     C_bn = to_dcm(x.q_nb.wxyz).T
     H = jnp.concatenate([C_bn @ skew(field_n), jnp.zeros((3, dim(x) - 3))], axis=1)
@@ -154,7 +144,7 @@ def observed(x: AnyState, field_n: Array):
 
 
 # (B5)
-def field_noise(sine: Array, x: AnyState, field_n: Array) -> Array:
+def field_noise(sine: Array, x: FieldState, field_n: Array) -> Array:
     """(3,) standard deviations: an angle, so in proportion to the field."""
     return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 

@@ -32,7 +32,7 @@ from robins.systems.parts import NED
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
 from robins.systems.rocket.claims import CLAIMS, angle_metrics, field_metrics
-from robins.systems.rocket.field import FIELD, SNAPSHOT, FieldState, ScaledState
+from robins.systems.rocket.field import FIELD, SNAPSHOT, FieldState
 from robins.systems.rocket.parameters import FieldVector, MagneticAttitude, RocketFlight
 from robins.systems.rocket.world import (
     BODY,
@@ -284,11 +284,10 @@ def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: Roc
     start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
     q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, field_n.shape)
     errors = (world.bias, scale) if scaled else (world.bias,)
-    state = ScaledState if scaled else FieldState
     return Case(
-        start=Belief(state(start, *(zero for _ in errors)), jnp.diag(sigma)),
+        start=Belief(FieldState(start, *(zero for _ in errors)), jnp.diag(sigma)),
         u=field.bridged(world.theta_b),
-        truth=state(Rotation(q_nb), *errors),
+        truth=FieldState(Rotation(q_nb), *errors),
         rows=field.rows_of(q_nb, field_n, len(sigma)),
         **taken(of, world),
     )

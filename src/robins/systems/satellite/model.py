@@ -166,9 +166,9 @@ def make_filter(build: Build) -> Filter:
     if build == "adaptive":
         return adaptive(parts={"gyro": slice(None)})
     if build == "redesigned":  # imported here: other filters need no designs
-        from robins.systems.satellite.stepwise import redesigned
+        from robins.systems.satellite.stepwise import LmiStep
 
-        return kalman(taylor(), [redesigned()])
+        return kalman(taylor(), [LmiStep()])
     reopened = gate(GATE, PATIENCE, "reinitialise")
     held = constant_gain({STAR: np.zeros((6, 3))})
     rules = {"gated": [reopened], "fixed": [held], "fixed-gated": [reopened, held]}

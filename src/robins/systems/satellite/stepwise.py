@@ -135,7 +135,13 @@ class RedesignMemory(NamedTuple):
 
 @value
 class LmiStep(Rule):
-    """The rule of `redesigned`."""
+    """Update with the gain of an LMI for the plant at the current rate, solved on the host.
+
+    A frame whose design fails uses the last accepted gain. The covariance is the one for the gain
+    used, as with `constant_gain`. Begin a state by `initial_state`.
+
+    Notes: ``lmi_step.failed``, true if the design of this frame failed.
+    """
 
     name = NAME
 
@@ -184,22 +190,11 @@ class LmiStep(Rule):
             )
 
 
-def redesigned() -> Rule:
-    """Update with the gain of an LMI for the plant at the current rate, solved on the host.
-
-    A frame whose design fails uses the last accepted gain. The covariance is the one for the gain
-    used, as with `constant_gain`. Begin a state by `initial_state`.
-
-    Notes: ``lmi_step.failed``, true if the design of this frame failed.
-    """
-    return LmiStep()
-
-
 def initial_state(state: FilterState, of: FrozenPlant, gain: Numbers) -> FilterState:
-    """Initial state of a filter with the rule `redesigned`.
+    """Initial state of a filter with the rule `LmiStep`.
 
     Args:
-        state: of a filter with the rule `redesigned`.
+        state: of a filter with the rule `LmiStep`.
         of: plant data.
         gain: (6, 3), used until the first design passes.
     """

@@ -48,7 +48,8 @@ from robins.systems.ins_gnss.recording import (
     with_lever_arm,
 )
 from robins.systems.ins_gnss.reported import antenna_of, distances, fix_arrays
-from robins.systems.ins_gnss.world import drive_dataset, motion_of
+from robins.systems.ins_gnss.world import drive_dataset
+from robins.systems.parts import motion_of
 from robins.systems.suspects import sentences, tables, words
 from robins.systems.tables import attitude_array, block_array, track_arrays
 
@@ -118,7 +119,8 @@ def timing(given: NavigationParameters) -> Timing:
         return Timing(1.0 / _rate_hz(samples), len(samples), 0)
     lasts_s, rate_hz = given.duration, given.imu_rate
     if given.drive is not None:
-        lasts_s, rate_hz = motion_of(given.drive).duration_s, given.drive.imu_rate
+        drive = given.drive
+        lasts_s, rate_hz = motion_of(drive.place, drive.legs).duration_s, drive.imu_rate
     return Timing(1.0 / rate_hz, round(lasts_s * rate_hz), 0)
 
 

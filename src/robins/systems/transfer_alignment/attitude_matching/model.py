@@ -32,15 +32,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins import _float64, units  # noqa: F401
 from robins.earth import earth_rate_n, transport_rate_n
-from robins.filters import Belief, Model, Motion, Sensor
+from robins.filters import Belief, Model, Sensor
 from robins.ins.frames import swap
 from robins.rotation import Rotation, skew
-from robins.sim.flexure import Flexure, transition
+from robins.sim.flexure import Flexure, stationary_sigma, swing
+from robins.systems.parts import moved_by, seen_by
 from robins.systems.transfer_alignment.attitude_matching.parameters import (
     AttitudeMatching,
     BankTurn,
@@ -129,8 +129,7 @@ class LinearSystem(NamedTuple):
         program, in any unit and for any noise. F is the input of the motion and H that of the
         sensor: see `inputs`.
         """
-        G = jnp.asarray(self.G)
-        return Model(Motion(_move, G, linear=Partial(_moved, G)), (reading(float(sigma)),))
+        return Model(moved_by(None, _moved, jnp.asarray(self.G)), (reading(float(sigma)),))
 
     def inputs(self) -> tuple[Array, dict[str, Array]]:
         """``u`` and ``aux`` of a run."""
@@ -139,19 +138,11 @@ class LinearSystem(NamedTuple):
 
 def reading(sigma: ArrayLike) -> Sensor:
     """Sensor of the matched attitude, with white noise of this sigma on each axis."""
-    return Sensor(_read, jnp.full(3, sigma), 3, ATTITUDE, linear=_seen)
-
-
-def _move(x, F):
-    return F @ x
+    return seen_by(_seen, jnp.full(3, sigma), 3, ATTITUDE)
 
 
 def _moved(G, x, F):
     return F @ x, F, G
-
-
-def _read(x, H):
-    return H @ x
 
 
 def _seen(x, H):
@@ -211,25 +202,8 @@ def linear_system(
     )
     if flexure is None:
         return rigid
-    swing, drive, swing_sigma = _swing(flexure, T)
+    swings, drive = (np.asarray(a) for a in swing(flexure, T))
     Phi = np.zeros((updates, STATES_FLEXIBLE, STATES_FLEXIBLE))
-    Phi[:, :STATES, :STATES], Phi[:, STATES:, STATES:] = rigid.F, swing
+    Phi[:, :STATES, :STATES], Phi[:, STATES:, STATES:] = rigid.F, swings
     G = np.asarray(scipy.linalg.block_diag(rigid.G, drive))
-    return LinearSystem(Phi, G, H, np.concatenate([rigid.sigma, swing_sigma]))
-
-
-def _swing(flexure: Flexure, period_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transition, noise factor and stationary spread of [lambda, lambda'], three axes each."""
-    sizes = zip(np.asarray(flexure.sigma_rad), np.asarray(flexure.tau_s), strict=True)
-    axes = [transition(sigma, tau, flexure.damping, period_s) for sigma, tau in sizes]
-    Phi, L = (np.array(a) for a in zip(*axes, strict=True))  # (3, 2, 2)
-    stationary = [
-        scipy.linalg.solve_discrete_lyapunov(p, q @ q.T) for p, q in zip(Phi, L, strict=True)
-    ]
-    sigma = np.sqrt([np.diag(P) for P in stationary])  # angle and rate are uncorrelated
-    return _by_axis(Phi), _by_axis(L), sigma.T.ravel()
-
-
-def _by_axis(of_axis: np.ndarray) -> np.ndarray:
-    """Assemble matrices (3, 2, 2) of (angle, rate) into one (6, 6) of three angles, three rates."""
-    return np.block([[np.diag(of_axis[:, i, j]) for j in (0, 1)] for i in (0, 1)])
+    return LinearSystem(Phi, G, H, np.concatenate([rigid.sigma, stationary_sigma(flexure)]))

@@ -21,16 +21,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from robins import units
-from robins.filters import Filter, Motion, kalman
+from robins.filters import Filter, kalman
 from robins.filters.composite.bank import EVERY, HypothesisRow, bank, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
 from robins.filters.values import Numbers, number
 from robins.sim.flexure import Flexure, transition
+from robins.systems.parts import moved_by
 from robins.systems.transfer_alignment.attitude_matching import model as am
 
 _SIGMAS, _TIMES_S, _FLUTTERS = (4.64, 10.0, 21.5, 46.4), (1.0, 10.0), (0.0, 3.0)
@@ -63,16 +64,8 @@ def hypotheses() -> list[HypothesisRow]:
     ]
 
 
-def _with(F: Array, swing: Array) -> Array:
-    return F.at[am.STATES :, am.STATES :].set(swing)
-
-
-def _move(swing, x, F):
-    return _with(F, swing) @ x
-
-
 def _moved(swing, noise, x, F):
-    F = _with(F, swing)
+    F = F.at[am.STATES :, am.STATES :].set(swing)
     return F @ x, F, noise
 
 
@@ -83,9 +76,8 @@ def _mode(weight: Rule, given: tuple[Numbers, ...], row: StructureHypothesis) ->
     swing = jnp.where(jnp.asarray(row.sigma) > 0.0, jnp.kron(Phi, jnp.eye(3)), 0.0)
     drive = jnp.zeros((am.STATES_FLEXIBLE, 6)).at[am.STATES :].set(jnp.kron(L, jnp.eye(3)))
     G = jnp.concatenate([gyro, drive], axis=1)
-    motion = Motion(Partial(_move, swing), G, linear=Partial(_moved, swing, G))
     white = noise_rad * jnp.hypot(1.0, row.flutter)
-    return Mode(kalman(rules=(weight,)), motion, (am.reading(white),))
+    return Mode(kalman(rules=(weight,)), moved_by(None, _moved, swing, G), (am.reading(white),))
 
 
 def structure_filter(

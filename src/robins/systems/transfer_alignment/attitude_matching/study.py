@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,20 +47,13 @@ TOLD = {
 }
 
 
-class PaperFilter(NamedTuple):
-    """The paper's filter: R = I, L = I and gamma in a unit of angle."""
-
-    unit: str
-    identity: bool = False  # P0 = I in that unit too
-    bounded: bool = True  # else gamma = inf
-
-
+# The paper's filter: the unit in which R = I, L = I and gamma; two are variants of it.
 IN_UNIT = {
-    "hinf-rad": PaperFilter("rad"),
-    "hinf-rad-identity": PaperFilter("rad", identity=True),
-    "hinf-deg": PaperFilter("deg"),
-    "hinf-deg-inf": PaperFilter("deg", bounded=False),
-    "hinf-arcmin": PaperFilter("arcmin"),
+    "hinf-rad": "rad",
+    "hinf-rad-identity": "rad",  # P0 = I in that unit too
+    "hinf-deg": "deg",
+    "hinf-deg-inf": "deg",  # gamma = inf
+    "hinf-arcmin": "arcmin",
 }
 FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted", "adaptive")
 
@@ -102,11 +95,10 @@ def contender(given: AttitudeMatching, course: MatchingCourse, name: str) -> Con
         share = given.h_infinity.weighted_over_least
         facts = existence(weighted_filter(), system, sigma, course, over_least=share)
         return _contender(weighted_filter(), system, sigma, facts)
-    paper = IN_UNIT[name]
-    one = units.parse(f"1 {paper.unit}", "angle")
-    if paper.identity:
+    one = units.parse(f"1 {IN_UNIT[name]}", "angle")
+    if name == "hinf-rad-identity":
         system = system._replace(sigma=np.full(am.STATES, one))
-    gamma = given.h_infinity.gamma * one if paper.bounded else np.inf
+    gamma = np.inf if name == "hinf-deg-inf" else given.h_infinity.gamma * one
     facts = existence(central_filter(), system, one, course, gamma)
     return _contender(central_filter(), system, one, facts, one)
 

@@ -50,7 +50,6 @@ and the delay. The Jacobian of the position follows by differentiation.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -66,7 +65,7 @@ from robins.ins.errors import frame_dynamics
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.rotation import Rotation, left_jacobian, skew
-from robins.sim.flexure import Flexure, transition
+from robins.sim.flexure import Flexure, swing
 from robins.systems.parts import NED, ImuBlock, moved_by
 from robins.systems.study import SensorAxes
 
@@ -105,13 +104,7 @@ _ProductNoise = tuple[InsNoise, Flexure | None]  # of the slave and of its mount
 
 def _swing(flexure: Flexure, block: ImuBlock) -> tuple[Array, Array]:
     """(2) over a block: Phi (6, 6) of (l, l'), and a factor (6, 6) of Q."""
-    dt = jnp.sum(jnp.asarray(block.increments.dt))
-    given = (flexure.sigma_rad, flexure.tau_s, flexure.damping)
-    three = [jnp.broadcast_to(jnp.asarray(x, float), 3) for x in given]
-    axes = jax.vmap(partial(transition, dt_s=dt))(*three)
-    # (3, 2, 2) of (angle, rate) by axis: angles first, then rates
-    Phi, L = (jnp.einsum("aij,ab->iajb", x, jnp.eye(3)).reshape(6, 6) for x in axes)
-    return Phi, L
+    return swing(flexure, jnp.sum(jnp.asarray(block.increments.dt)))
 
 
 def _step(drive: _ProductNoise, x: ProductState, block: ImuBlock) -> ProductState:

@@ -43,12 +43,10 @@ class Sway(Parameters):
     phase: q.Angle = default("0 deg")
 
 
-class Heave(Parameters):
+class Heave(Sway):
     """A sine of height."""
 
     amplitude: Annotated[float, Quantity("length", least="0 m", most="1 km")]
-    period: q.Duration
-    phase: q.Angle = default("0 deg")
 
 
 class Aircraft(Departure):

@@ -21,7 +21,7 @@ from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.results import Probability, Variables
 from robins.rotation import Rotation
-from robins.sim.flexure import Flexure, transition
+from robins.sim.flexure import Flexure, stationary_sigma
 from robins.systems.judgement import (
     Claim,
     Metric,
@@ -75,15 +75,19 @@ def installation_of(pair: PairParameters) -> pm.Installation:
     return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
+def _matched(believed: PairAssumptions) -> list[str]:
+    """Names of the records of the master that a filter takes."""
+    return [name for name in pm.RECORDS if name != pm.POSITION or believed.position]
+
+
 def model_of(pair: PairParameters, believed: PairAssumptions, flexure: Flexure | None) -> Model:
     """The product model by its parameters.
 
     Raises:
         ValueError: a noise of the master is zero, so that its records cannot be weighted.
     """
-    matched = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if believed.position else ()))
     sigmas = {}
-    for name in matched:
+    for name in _matched(believed):
         key = pm.RECORDS[name].sigma
         sigmas[name] = np.asarray(getattr(pair.master, key))
         if not np.all(sigmas[name] > 0.0):
@@ -108,12 +112,7 @@ def start_sigma(
     parts = [start.attitude, start.velocity, start.position]
     parts += [slave.gyro_sigma, slave.accel_left, believed.mounting]
     sigma = np.maximum(np.concatenate([np.asarray(p, float) for p in parts]), _LEAST)
-    if flexure is None:
-        return sigma
-    # of the steady state, the factor of whose covariance is that of a very long step
-    three = zip(flexure.sigma_rad, flexure.tau_s, strict=True)
-    steady = [transition(s, t, flexure.damping, 1e3 * t)[1] for s, t in three]
-    return np.concatenate([sigma, *np.sqrt(np.sum(np.asarray(steady) ** 2, axis=2)).T])
+    return sigma if flexure is None else np.concatenate([sigma, stationary_sigma(flexure)])
 
 
 def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) -> Case:
@@ -266,11 +265,10 @@ def faults(given: PairParameters, epoch_s: np.ndarray) -> dict[str, np.ndarray]:
 def _view(given: Product, course: PairCourse) -> View:
     refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
     path = course.path.position
-    used = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if given.believed.position else ()))
     return View(
         epoch_s=course.epoch_s,
         blocks=tuple(_REPORTED.values()),
-        sensors={name: SENSORS[name] for name in used},
+        sensors={name: SENSORS[name] for name in _matched(given.believed)},
         metrics=product_metrics,
         context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),
         shown=tracks,

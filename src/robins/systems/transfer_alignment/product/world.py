@@ -35,7 +35,6 @@ from robins.ins.state import InsState
 from robins.manifold import retract
 from robins.rotation import Rotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.scenario import Span
-from robins.sim.commands import from_commands
 from robins.sim.disturbance import drift_step, outlier_factor, student_t, window_factor
 from robins.sim.flexure import simulate_flexure
 from robins.sim.ideal_imu import ideal_increments
@@ -44,6 +43,7 @@ from robins.sim.manoeuvres import MODERATE_SEA, BankedTurn, SeaMotion, Wave, fly
 from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import MotionProfile, at_lever_arm
 from robins.systems.parts import any_there, as_array, outside, signed
+from robins.systems.parts import motion_of as driven
 from robins.systems.transfer_alignment.product.model import RECORDS, MasterQuantity, ProductState
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
@@ -101,8 +101,7 @@ def motion_of(manoeuvre: Aircraft | Ship | GroundVehicle) -> MotionProfile:
         if any(waves is not None for waves in given):
             sea = SeaMotion(*(_waves(waves or ()) for waves in given))
         return sail(start, m.seconds, m.speed, m.heading, sea)
-    legs = [leg.command() for leg in m.legs]
-    return roughen(from_commands(start, legs, m.heading, m.speed), _waves(m.roll), _waves(m.pitch))
+    return roughen(driven(m, m.legs, m.speed), _waves(m.roll), _waves(m.pitch))
 
 
 def _waves(waves) -> tuple[Wave, ...]:

@@ -39,13 +39,14 @@ from jaxtyping import Array, ArrayLike, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth import OMEGA_E, curvature_radii
-from robins.filters import Model, Motion, Sensor
+from robins.filters import Model
 from robins.ins.frames import euler_enu_rfu, swap, swap_q
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
 from robins.ins.state import InsState
 from robins.manifold import retract, wrap
 from robins.rotation import conjugate, multiply, rotate, to_dcm, to_euler
+from robins.systems.parts import moved_by, seen_by
 
 STATES = 12
 LAT, LON, VE, VN, PHI_E, PHI_N, PHI_U, NABLA_X, NABLA_Y, EPS_X, EPS_Y, EPS_Z = range(STATES)
@@ -138,6 +139,10 @@ def _moved(x: Array, interval: Interval) -> tuple[Array, Array, Array]:
     return Phi @ x, Phi, interval.sigma
 
 
+def _velocity(x: Array, sigma: Array) -> tuple[Array, Array]:
+    return x[VELOCITY], jnp.eye(STATES)[VELOCITY]
+
+
 def _angles(x: Array, aux: tuple[Array, Array]) -> tuple[Array, Array]:
     C_nb, _ = aux
     H = measurement_matrix(C_nb)[2:]
@@ -145,22 +150,10 @@ def _angles(x: Array, aux: tuple[Array, Array]) -> tuple[Array, Array]:
 
 
 MODEL = Model(
-    Motion(lambda x, interval: _moved(x, interval)[0], lambda x, interval: interval.sigma, _moved),
+    moved_by(None, _moved),
     (
-        Sensor(
-            lambda x, sigma: x[VELOCITY],
-            lambda x, sigma: sigma,
-            2,
-            VELOCITY_SENSOR,
-            lambda x, sigma: (x[VELOCITY], jnp.eye(STATES)[VELOCITY]),
-        ),
-        Sensor(
-            lambda x, aux: _angles(x, aux)[0],
-            lambda x, aux: aux[1],
-            3,
-            ATTITUDE_SENSOR,
-            _angles,
-        ),
+        seen_by(_velocity, lambda x, sigma: sigma, 2, VELOCITY_SENSOR),
+        seen_by(_angles, lambda x, aux: aux[1], 3, ATTITUDE_SENSOR),
     ),
 )
 """The model. Its motion takes an `Interval` for each step, the sensor of velocity (VE, VN) its (2,)
