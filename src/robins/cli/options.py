@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -18,6 +20,14 @@ RESULTS = Path("results")
 def examples(*lines: str) -> str:
     """End of a help text; a control character keeps click from joining its lines."""
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
+
+
+def examples_in(text: str | None) -> Mapping[str, str]:
+    """Examples of each command in the docstring of a module, by the last word of their heading."""
+    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text or "")
+    blocks = (map(str.strip, part.strip().splitlines()) for part in parts[1::2])
+    found = {name: examples(*lines) for name, lines in zip(parts[::2], blocks, strict=True)}
+    return defaultdict(str, found)  # python -OO keeps no docstring
 
 
 DEBUG = option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
