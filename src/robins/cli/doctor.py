@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from robins.cli.frame import ExitStatus, only_json
 from robins.cli.printing import print_data
 from robins.errors import RobinsError
+
+if TYPE_CHECKING:
+    from robins.dataset import Finding
+    from robins.workbench.doctor import LogExamination
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 _KINDS = {
@@ -23,7 +27,7 @@ _KINDS = {
 }
 
 
-def warn(findings: Sequence[Any]) -> None:
+def warn(findings: Sequence[Finding]) -> None:
     """Print warnings and notes on a log at once; errors end the command and are printed there."""
     for finding in findings:
         if finding.severity != "error":
@@ -55,7 +59,7 @@ def judge(
     return ExitStatus.BAD_INPUT if found.counts["error"] else ExitStatus.DONE
 
 
-def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
+def _text(found: LogExamination, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
     from robins.workbench.doctor import typed
 
     lines = []

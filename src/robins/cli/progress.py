@@ -21,7 +21,9 @@ class Progress:
     even if it was not called yet (as in a compilation), and erases both at the end.
     """
 
-    def __init__(self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S):
+    def __init__(
+        self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S
+    ):
         self._stream = sys.stderr if stream is None else stream
         self._lock = threading.Lock()
         self._share, self._what = 0.0, what
@@ -81,7 +83,7 @@ class Progress:
             self._timer.start()
         return self
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._timer.cancel()
         with self._lock:
             if self._bar is None:
