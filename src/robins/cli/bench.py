@@ -52,6 +52,7 @@ from robins.cli.options import (
     answers,
     examples_in,
     folder_name,
+    of_value,
     publishes,
 )
 from robins.cli.printing import carry_out, print_data
@@ -65,9 +66,7 @@ def bench() -> None:
     """The test bench: each part of a vehicle is a process or a board on a serial line."""
 
 
-def _ports(
-    _context: click.Context, _given: click.Parameter, texts: tuple[str, ...]
-) -> dict[str, str]:
+def _ports(texts: tuple[str, ...]) -> dict[str, str]:
     found = {}
     for text in texts:
         part, equals, port = text.partition("=")
@@ -78,6 +77,14 @@ def _ports(
 
 
 _SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of all noise. [default: 0]")
+_NODE = option(
+    "--node",
+    "ports",
+    multiple=True,
+    callback=of_value(_ports),
+    metavar="PART=PORT",
+    help="Or =PROGRAM.",
+)
 _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with.")
 
 
@@ -90,7 +97,7 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with
 @option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="For a late step.")
 @option("--on-death", type=click.Choice(["fail", "restart"]), help="If a part dies.")
 @option("--restarts", type=click.IntRange(1, 100_000), help="Upper limit. [default: 10]")
-@option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="Or =PROGRAM.")
+@_NODE
 @option("--baud", type=click.IntRange(300), help="Speed of the virtual lines.")
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")
 @option("--live", is_flag=True, help="Serve a page that shows the run.")

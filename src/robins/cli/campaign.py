@@ -56,7 +56,7 @@ from click import option
 
 from robins.cli import cache
 from robins.cli.frame import ExitStatus, command_line, only_json
-from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples_in
+from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples_in, of_value
 from robins.cli.printing import carry_out, print_and_write, print_data
 from robins.cli.progress import Progress
 
@@ -88,7 +88,7 @@ _PATIENCE_S = 600.0  # wait for a report that another coordinator writes
 _WHERE = click.argument("where", metavar="DIR")
 
 
-def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
+def _held(held: bool) -> None:
     """End this process when its parent closes its standard input, or has ended."""
     if not held:
         return
@@ -148,7 +148,7 @@ def _deliver(
     short_help="Compute what is missing, as one more worker.", epilog=EXAMPLES["work"]
 )
 @_WHERE
-@option("--held", is_flag=True, hidden=True, expose_value=False, callback=_held)
+@option("--held", is_flag=True, hidden=True, expose_value=False, callback=of_value(_held))
 @TRUST
 @answers
 def work(where: str, as_json: bool) -> None:
@@ -161,12 +161,8 @@ def work(where: str, as_json: bool) -> None:
     with only_json(as_json), Progress() as progress:
         for done, total in bench.campaign_work(where):
             progress(done / total, f"{done} of {total} shards")
-    data = {"done": done, "shards": total}
-    print_data(
-        data,
-        f"{done} of {total} shards are there.\nNext:   robins campaign report {where}",
-        as_json,
-    )
+    text = f"{done} of {total} shards are there.\nNext:   robins campaign report {where}"
+    print_data({"done": done, "shards": total}, text, as_json)
 
 
 @campaign.command(short_help="How far a campaign is.", epilog=EXAMPLES["status"])

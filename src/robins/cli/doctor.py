@@ -72,13 +72,11 @@ def _text(found: LogExamination, log: Sequence[Path], columns: Sequence[Path | s
         lines.append(f"{severity} {finding.sentence}")
     counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in found.counts.items()]
     lines.append(f"{', '.join(counts)}.")
-    if found.counts["error"]:
-        return "\n".join(
-            [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
-        )
     kinds = {table["kind"] for table in found.tables}
-    if "imu" not in kinds:
-        return "\n".join([*lines, "Next:   give the log of an IMU too; a replay needs its samples"])
     # Without fixes there is no position, but an attitude.
-    system = "" if "gnss" in kinds else " --system marg"
-    return "\n".join([*lines, f"Next:   robins replay {typed(log, columns)}{system}"])
+    then = f"robins replay {typed(log, columns)}{'' if 'gnss' in kinds else ' --system marg'}"
+    if found.counts["error"]:
+        then = "mend the errors; a run on this log would be wrong or meaningless"
+    elif "imu" not in kinds:
+        then = "give the log of an IMU too; a replay needs its samples"
+    return "\n".join([*lines, f"Next:   {then}"])

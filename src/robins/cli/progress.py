@@ -21,9 +21,7 @@ class Progress:
     even if it was not called yet (as in a compilation), and erases both at the end.
     """
 
-    def __init__(
-        self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S
-    ):
+    def __init__(self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S):
         self._stream = sys.stderr if stream is None else stream
         self._lock = threading.Lock()
         self._share, self._what = 0.0, what
