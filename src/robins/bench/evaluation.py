@@ -219,7 +219,7 @@ def rms(error: np.ndarray) -> float | None:
 _UNITS = {"arcsec": "arcsec", "deg": "deg", "m_s": "m/s", "m": "m"}
 
 
-def figures_of(metrics: Mapping[str, float | None]) -> list[str]:
+def figures_of(metrics: Mapping[str, float | int | None]) -> list[str]:
     """Lines of figures for a terminal; their names end in the unit."""
     lines = []
     for name, value in metrics.items():
