@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+import xarray as xr
 
 from robins.bench.accounting import Latencies
 from robins.bench.broker.faults import FaultTable
@@ -208,10 +209,17 @@ def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
     return np.asarray(some[heard[-1]] if len(heard) else np.full(values.shape[1:], np.nan))
 
 
+def rms(error: np.ndarray) -> float | None:
+    """RMS length of the rows (E, ...) that are whole; None: there is none."""
+    squares = np.sum(np.square(error), axis=tuple(range(1, error.ndim)))
+    known = squares[np.isfinite(squares)]
+    return float(np.sqrt(np.mean(known))) if len(known) else None
+
+
 _UNITS = {"arcsec": "arcsec", "deg": "deg", "m_s": "m/s", "m": "m"}
 
 
-def figures_of(metrics: Mapping[str, Any]) -> list[str]:
+def figures_of(metrics: Mapping[str, float | int | None]) -> list[str]:
     """Lines of figures for a terminal; their names end in the unit."""
     lines = []
     for name, value in metrics.items():
@@ -222,9 +230,9 @@ def figures_of(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def arrays_of(messages: Sequence[Message], series: MessageSeries) -> dict[str, Any]:
+def arrays_of(messages: Sequence[Message], series: MessageSeries) -> dict[str, xr.Variable]:
     """Every number as an array of the solution, with its unit."""
-    out: dict[str, Any] = {}
+    out: dict[str, xr.Variable] = {}
     for m, f in drawn(messages):
         values = series[f"{m.name}.{f.name}"].reshape(1, len(series.time_s), f.length)
         about = {"unit": f.unit, "long_name": f"{m.name}: {f.name}", "comment": f.text}

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from robins.bench.broker.console import Console, OperatorMessage
-    from robins.bench.broker.faults import DeviceFault, FaultTable, LinkFault
+    from robins.bench.broker.faults import DeviceFaults, FaultTable, LinkFault, ParameterTable
     from robins.bench.evaluation import PageView, RunFigures, RunResult
     from robins.bench.recording.topics import Topic
 
@@ -268,11 +268,11 @@ class Rig(Generic[GivenT, KitT]):
         found = sorted((Path(file).parent / "scenarios").glob("*.toml")) if file else []
         return {path.stem: path for path in found}
 
-    def options(self) -> Mapping[str, Any]:
+    def options(self) -> ParameterTable:
         """Parameters of a run besides those of all rigs, each with type and default."""
         return {}
 
-    def device_faults(self) -> tuple[Mapping[str, DeviceFault], Mapping[str, Any]]:
+    def device_faults(self) -> DeviceFaults:
         """Faults of its sensors and actuators, by kind, and their parameters."""
         return {}, {}
 
@@ -315,7 +315,7 @@ class Rig(Generic[GivenT, KitT]):
         """The parameters of a fault."""
         from robins.bench.broker.faults import faults_of
 
-        return faults_of(self.table, **self.device_faults()[1])
+        return faults_of(self.table, self.device_faults()[1])
 
     @cached_property
     def operator_console(self) -> Console:

@@ -9,7 +9,7 @@ import re
 import secrets
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,7 @@ class BenchStatus:
         """True when the next report is due."""
         return time.monotonic() - self._told >= EACH_S
 
-    def tell(self, state: Mapping[str, Any]) -> None:
+    def tell(self, state: Report) -> None:
         """Report the state; neither a full disk nor a folder of another user stops a run."""
         self._told = time.monotonic()
         content = json.dumps({**state, "pid": os.getpid(), "at": time.time()})

@@ -1,4 +1,37 @@
-"""The commands of the test bench and their options."""
+"""The commands of the test bench and their options.
+
+Examples of `robins bench`::
+
+    robins bench up satellite/s1                  seven processes, one loop, bit for bit
+    robins bench up satellite/s1 --live           with a page to watch it
+    robins bench up noisy-line                    damaged, lost, late frames
+    robins bench up ins-gnss/drive --filter ekf   inertial unit, receiver, navigation
+    robins bench up satellite/s1 --clock realtime --node gyro=/dev/ttyUSB0,460800
+    robins bench replay results/bench-satellite-s1/record.mcap --node adm
+
+Examples of `robins bench up`::
+
+    robins bench up satellite/s1 --seconds 60
+    robins bench up satellite/s2 --filter mixed-bias --live
+    robins bench up wrong-star --filter mekf
+    robins bench up satellite/s1 --clock realtime --rate 100 --seconds 60 --json
+    robins bench up satellite/s1 --set gyro.bias="10 deg/h" --node gyro=/dev/ttyUSB0
+
+Examples of `robins bench replay`::
+
+    robins bench replay results/bench-satellite-s1/record.mcap --node adm
+    robins bench replay record.mcap --node adm --filter ekf-quaternion
+    robins bench replay record.mcap --node adm --diff other.mcap
+
+Examples of `robins bench node`::
+
+    robins bench node gyro /dev/ttyUSB0,460800 satellite/s1 --seed 3
+
+Examples of `robins bench header`::
+
+    robins bench header > robins_wire.h
+    robins bench header --to board
+"""
 
 from __future__ import annotations
 
@@ -17,32 +50,23 @@ from robins.cli.options import (
     SETTINGS,
     TRUST,
     answers,
-    examples,
+    examples_in,
     folder_name,
+    of_value,
     publishes,
 )
 from robins.cli.printing import carry_out, print_data
 from robins.cli.progress import Progress
 
+EXAMPLES = examples_in(__doc__)
 
-@click.group(
-    short_help="Run a vehicle part by part over serial lines.",
-    epilog=examples(
-        "robins bench up satellite/s1                  seven processes, one loop, bit for bit",
-        "robins bench up satellite/s1 --live           with a page to watch it",
-        "robins bench up noisy-line                    damaged, lost, late frames",
-        "robins bench up ins-gnss/drive --filter ekf   inertial unit, receiver, navigation",
-        "robins bench up satellite/s1 --clock realtime --node gyro=/dev/ttyUSB0,460800",
-        "robins bench replay results/bench-satellite-s1/record.mcap --node adm",
-    ),
-)
+
+@click.group(short_help="Run a vehicle part by part over serial lines.", epilog=EXAMPLES["bench"])
 def bench() -> None:
     """The test bench: each part of a vehicle is a process or a board on a serial line."""
 
 
-def _ports(
-    _context: click.Context, _given: click.Parameter, texts: tuple[str, ...]
-) -> dict[str, str]:
+def _ports(texts: tuple[str, ...]) -> dict[str, str]:
     found = {}
     for text in texts:
         part, equals, port = text.partition("=")
@@ -53,19 +77,18 @@ def _ports(
 
 
 _SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of all noise. [default: 0]")
+_NODE = option(
+    "--node",
+    "ports",
+    multiple=True,
+    callback=of_value(_ports),
+    metavar="PART=PORT",
+    help="Or =PROGRAM.",
+)
 _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with.")
 
 
-@bench.command(
-    short_help="Start a bench and run a scenario on it.",
-    epilog=examples(
-        "robins bench up satellite/s1 --seconds 60",
-        "robins bench up satellite/s2 --filter mixed-bias --live",
-        "robins bench up wrong-star --filter mekf",
-        "robins bench up satellite/s1 --clock realtime --rate 100 --seconds 60 --json",
-        'robins bench up satellite/s1 --set gyro.bias="10 deg/h" --node gyro=/dev/ttyUSB0',
-    ),
-)
+@bench.command(short_help="Start a bench and run a scenario on it.", epilog=EXAMPLES["up"])
 @click.argument("scenario")
 @_FILTER
 @option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Length. [default: all]")
@@ -74,7 +97,7 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with
 @option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="For a late step.")
 @option("--on-death", type=click.Choice(["fail", "restart"]), help="If a part dies.")
 @option("--restarts", type=click.IntRange(1, 100_000), help="Upper limit. [default: 10]")
-@option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="Or =PROGRAM.")
+@_NODE
 @option("--baud", type=click.IntRange(300), help="Speed of the virtual lines.")
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")
 @option("--live", is_flag=True, help="Serve a page that shows the run.")
@@ -121,12 +144,7 @@ def status(as_json: bool) -> None:
 
 
 @bench.command(
-    short_help="Send a record to a part again and compare its answers.",
-    epilog=examples(
-        "robins bench replay results/bench-satellite-s1/record.mcap --node adm",
-        "robins bench replay record.mcap --node adm --filter ekf-quaternion",
-        "robins bench replay record.mcap --node adm --diff other.mcap",
-    ),
+    short_help="Send a record to a part again and compare its answers.", epilog=EXAMPLES["replay"]
 )
 @click.argument("record", type=LOGS)
 @option("--node", required=True, metavar="PART", help="Which part.")
@@ -163,10 +181,7 @@ def ports(as_json: bool) -> None:
     print_data({"ports": [port._asdict() for port in found]}, table(found), as_json)
 
 
-@bench.command(
-    short_help="Run one part at a port, by hand.",
-    epilog=examples("robins bench node gyro /dev/ttyUSB0,460800 satellite/s1 --seed 3"),
-)
+@bench.command(short_help="Run one part at a port, by hand.", epilog=EXAMPLES["node"])
 @click.argument("part")
 @click.argument("port")
 @click.argument("scenario")
@@ -188,10 +203,7 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
     click.echo("The bench has said stop.")
 
 
-@bench.command(
-    short_help="Print the wire as a C header, for firmware.",
-    epilog=examples("robins bench header > robins_wire.h", "robins bench header --to board"),
-)
+@bench.command(short_help="Print the wire as a C header, for firmware.", epilog=EXAMPLES["header"])
 @click.argument("rig", default="satellite")
 @option("--to", type=click.Path(path_type=Path), metavar="DIR", help="Write the examples too.")
 @DEBUG

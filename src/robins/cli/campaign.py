@@ -1,33 +1,75 @@
-"""The commands of campaigns and their options."""
+"""The commands of campaigns and their options.
+
+Examples of `robins campaign`::
+
+    robins campaign run airship/s1 --runs 1000 --out airship   begin, or go on
+    robins campaign status airship                             how far is it?
+    robins campaign work airship                               one more worker
+    robins campaign report airship                             figures of all runs
+    robins campaign show airship --run 137                     that run alone
+    robins campaign verify airship                             is all as it was?
+
+Examples of `robins campaign run`::
+
+    robins campaign run transfer-alignment/s0 --runs 200 --out s0 --machine c
+    robins campaign run airship/s1 --runs 10000 --filters ekf --out airship --workers 8
+
+Examples of `robins campaign work`::
+
+    robins campaign work airship
+
+Examples of `robins campaign status`::
+
+    robins campaign status airship --json
+
+Examples of `robins campaign verify`::
+
+    robins campaign verify airship
+    robins campaign verify airship --share 0.1
+
+Examples of `robins campaign show`::
+
+    robins campaign show airship --run 137
+
+Examples of `robins campaign report`::
+
+    robins campaign report airship --out airship-report
+
+Examples of `robins sweep`::
+
+    robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
+    robins sweep transfer-alignment/s0 --vary h_infinity.gamma=20,50,100 --vary "flexure.sigma=1 arcmin,3 arcmin,9 arcmin" --runs 20 --out gammas
+"""  # noqa: E501
 
 from __future__ import annotations
 
 import importlib
 import os
 import threading
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import click
 from click import option
 
 from robins.cli import cache
 from robins.cli.frame import ExitStatus, command_line, only_json
-from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples
+from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples_in, of_value
 from robins.cli.printing import carry_out, print_and_write, print_data
 from robins.cli.progress import Progress
+
+if TYPE_CHECKING:
+    from robins.results import Outcome, Result
+    from robins.workbench.campaign import CampaignStatus
+
+EXAMPLES = examples_in(__doc__)
 
 
 @click.group(
     short_help="Run a scenario many times, on all cores or machines; nothing is lost.",
-    epilog=examples(
-        "robins campaign run airship/s1 --runs 1000 --out airship   begin, or go on",
-        "robins campaign status airship                             how far is it?",
-        "robins campaign work airship                               one more worker",
-        "robins campaign report airship                             figures of all runs",
-        "robins campaign show airship --run 137                     that run alone",
-        "robins campaign verify airship                             is all as it was?",
-    ),
+    epilog=EXAMPLES["campaign"],
 )
 def campaign() -> None:
     """Campaigns: thousands of runs, kept in a folder that any number of workers fill.
@@ -37,7 +79,7 @@ def campaign() -> None:
     """
 
 
-def _workbench() -> Any:
+def _workbench() -> ModuleType:
     cache.enable()
     return importlib.import_module("robins.workbench")
 
@@ -46,7 +88,7 @@ _PATIENCE_S = 600.0  # wait for a report that another coordinator writes
 _WHERE = click.argument("where", metavar="DIR")
 
 
-def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
+def _held(held: bool) -> None:
     """End this process when its parent closes its standard input, or has ended."""
     if not held:
         return
@@ -59,13 +101,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-@campaign.command(
-    short_help="Begin a campaign, or go on with it.",
-    epilog=examples(
-        "robins campaign run transfer-alignment/s0 --runs 200 --out s0 --machine c",
-        "robins campaign run airship/s1 --runs 10000 --filters ekf --out airship --workers 8",
-    ),
-)
+@campaign.command(short_help="Begin a campaign, or go on with it.", epilog=EXAMPLES["run"])
 @click.argument("scenario")
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="How many. [default: as given]")
@@ -94,24 +130,25 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
     _deliver(bench, out, outcome, as_json)
 
 
-def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | None = None) -> None:
+def _deliver(
+    bench: ModuleType, where: str, outcome: Outcome, as_json: bool, to: Path | None = None
+) -> None:
     # several coordinators of a campaign end at the same time, each with all runs to report
     patience_s = 0.0 if to else _PATIENCE_S
     to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
     command, writing = command_line(), Progress("drawing figures")
 
-    def write() -> Any:
+    def write() -> Result:
         return bench.publish(outcome, to, command=command, progress=writing, patience_s=patience_s)
 
     print_and_write(outcome, write, writing, as_json)
 
 
 @campaign.command(
-    short_help="Compute what is missing, as one more worker.",
-    epilog=examples("robins campaign work airship"),
+    short_help="Compute what is missing, as one more worker.", epilog=EXAMPLES["work"]
 )
 @_WHERE
-@option("--held", is_flag=True, hidden=True, expose_value=False, callback=_held)
+@option("--held", is_flag=True, hidden=True, expose_value=False, callback=of_value(_held))
 @TRUST
 @answers
 def work(where: str, as_json: bool) -> None:
@@ -124,17 +161,11 @@ def work(where: str, as_json: bool) -> None:
     with only_json(as_json), Progress() as progress:
         for done, total in bench.campaign_work(where):
             progress(done / total, f"{done} of {total} shards")
-    data = {"done": done, "shards": total}
-    print_data(
-        data,
-        f"{done} of {total} shards are there.\nNext:   robins campaign report {where}",
-        as_json,
-    )
+    text = f"{done} of {total} shards are there.\nNext:   robins campaign report {where}"
+    print_data({"done": done, "shards": total}, text, as_json)
 
 
-@campaign.command(
-    short_help="How far a campaign is.", epilog=examples("robins campaign status airship --json")
-)
+@campaign.command(short_help="How far a campaign is.", epilog=EXAMPLES["status"])
 @_WHERE
 @answers
 def status(where: str, as_json: bool) -> None:
@@ -151,7 +182,7 @@ def status(where: str, as_json: bool) -> None:
         print_data(found._asdict(), _progress_text(where, found), as_json)
 
 
-def _points_text(where: str, found: dict[str, Any]) -> str:
+def _points_text(where: str, found: Mapping[str, CampaignStatus]) -> str:
     width, lines = max(map(len, found)), []
     for name, one in found.items():
         done = ", ".join(f"{filter_} {n}" for filter_, n in one.done.items())
@@ -162,7 +193,7 @@ def _points_text(where: str, found: dict[str, Any]) -> str:
     return "\n".join([*lines, f"Next:   robins campaign {then[0]} {where}{then[1]}"])
 
 
-def _progress_text(where: str, found: Any) -> str:
+def _progress_text(where: str, found: CampaignStatus) -> str:
     lines = [f"{found.scenario}, seed {found.seed}, by {found.machine}: {found.wanted} runs wanted"]
     for name in found.filters:
         shards_text = "".join(
@@ -184,7 +215,7 @@ def _progress_text(where: str, found: Any) -> str:
 
 @campaign.command(
     short_help="Compute a share of a campaign again, and compare the bits.",
-    epilog=examples("robins campaign verify airship", "robins campaign verify airship --share 0.1"),
+    epilog=EXAMPLES["verify"],
 )
 @_WHERE
 @option("--share", type=click.FloatRange(0.0, 1.0, min_open=True), default=0.01, show_default=True)
@@ -208,8 +239,7 @@ def verify(where: str, share: float, as_json: bool) -> int:
 
 
 @campaign.command(
-    short_help="One run of a campaign alone, with all its histories.",
-    epilog=examples("robins campaign show airship --run 137"),
+    short_help="One run of a campaign alone, with all its histories.", epilog=EXAMPLES["show"]
 )
 @_WHERE
 @option("--run", "number", type=click.IntRange(min=0), required=True, help="Its number.")
@@ -227,10 +257,7 @@ def _result(where: str, what: str) -> Path:
     return Path("results") / f"{where.rstrip('/').rpartition('/')[2]}-{what}"
 
 
-@campaign.command(
-    short_help="Figures of all runs that are there.",
-    epilog=examples("robins campaign report airship --out airship-report"),
-)
+@campaign.command(short_help="Figures of all runs that are there.", epilog=EXAMPLES["report"])
 @_WHERE
 @OUT
 @TRUST
@@ -249,11 +276,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
 
 @click.command(
     short_help="Run a scenario over the values of one parameter, or of two.",
-    epilog=examples(
-        'robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases',
-        "robins sweep transfer-alignment/s0 --vary h_infinity.gamma=20,50,100 "
-        '--vary "flexure.sigma=1 arcmin,3 arcmin,9 arcmin" --runs 20 --out gammas',
-    ),
+    epilog=EXAMPLES["sweep"],
 )
 @click.argument("scenario")
 @option("--vary", multiple=True, required=True, metavar="key=a,b,c", help="Once, or twice.")

@@ -17,7 +17,7 @@ from robins.cli.doctor import judge, warn
 from robins.cli.export import write
 from robins.cli.listing import listing
 from robins.cli.made import Made
-from robins.cli.options import COLUMNS, LOGS, RESULTS, folder_name
+from robins.cli.options import COLUMNS, LOGS, RESULTS, folder_name, of_value
 from robins.cli.printing import carry_out, print_data
 from robins.workbench import InputError
 
@@ -70,7 +70,7 @@ _ONE_RUN = option(
     "--runs",
     type=click.IntRange(min=1),
     expose_value=False,
-    callback=lambda _context, _given, runs: one_run(runs, "log"),
+    callback=of_value(lambda runs: one_run(runs, "log")),
     help="Monte Carlo runs. [default: as given]",
 )
 _PAIR = (

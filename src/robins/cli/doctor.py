@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from robins.cli.frame import ExitStatus, only_json
 from robins.cli.printing import print_data
 from robins.errors import RobinsError
+
+if TYPE_CHECKING:
+    from robins.dataset import Finding
+    from robins.workbench.doctor import LogExamination
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 _KINDS = {
@@ -23,7 +27,7 @@ _KINDS = {
 }
 
 
-def warn(findings: Sequence[Any]) -> None:
+def warn(findings: Sequence[Finding]) -> None:
     """Print warnings and notes on a log at once; errors end the command and are printed there."""
     for finding in findings:
         if finding.severity != "error":
@@ -55,7 +59,7 @@ def judge(
     return ExitStatus.BAD_INPUT if found.counts["error"] else ExitStatus.DONE
 
 
-def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
+def _text(found: LogExamination, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
     from robins.workbench.doctor import typed
 
     lines = []
@@ -68,13 +72,11 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str
         lines.append(f"{severity} {finding.sentence}")
     counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in found.counts.items()]
     lines.append(f"{', '.join(counts)}.")
-    if found.counts["error"]:
-        return "\n".join(
-            [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
-        )
     kinds = {table["kind"] for table in found.tables}
-    if "imu" not in kinds:
-        return "\n".join([*lines, "Next:   give the log of an IMU too; a replay needs its samples"])
     # Without fixes there is no position, but an attitude.
-    system = "" if "gnss" in kinds else " --system marg"
-    return "\n".join([*lines, f"Next:   robins replay {typed(log, columns)}{system}"])
+    then = f"robins replay {typed(log, columns)}{'' if 'gnss' in kinds else ' --system marg'}"
+    if found.counts["error"]:
+        then = "mend the errors; a run on this log would be wrong or meaningless"
+    elif "imu" not in kinds:
+        then = "give the log of an IMU too; a replay needs its samples"
+    return "\n".join([*lines, f"Next:   {then}"])

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.resources import files
 from inspect import signature
+from operator import not_
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -30,6 +31,7 @@ from robins.cli.options import (
     answers,
     as_names,
     examples,
+    of_value,
     publishes,
     result_name,
 )
@@ -184,12 +186,7 @@ def _option(name: str, kind: Any, option: options.Option, default: ast.expr | No
         metavar=option.metavar,
         required=default is None,
         multiple=several and not option.names,
-        callback=as_names if option.names else _opposite if opposite else None,
+        callback=of_value(as_names if option.names else not_) if option.names or opposite else None,
         show_default=option.shown,
         **settings,
     )
-
-
-def _opposite(_context: click.Context, _given: click.Parameter, value: bool) -> bool:
-    """Invert the value of the second of two opposite flags."""
-    return not value

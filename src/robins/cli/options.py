@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 from click import option
@@ -18,6 +21,22 @@ RESULTS = Path("results")
 def examples(*lines: str) -> str:
     """End of a help text; a control character keeps click from joining its lines."""
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
+
+
+def examples_in(text: str | None) -> Mapping[str, str]:
+    """Examples of each command in the docstring of a module, by the last word of their heading."""
+    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text or "")
+    blocks = (map(str.strip, part.strip().splitlines()) for part in parts[1::2])
+    found = {name: examples(*lines) for name, lines in zip(parts[::2], blocks, strict=True)}
+    return defaultdict(str, found)  # python -OO keeps no docstring
+
+
+Callback = Callable[[click.Context, click.Parameter, Any], Any]
+
+
+def of_value(function: Callable) -> Callback:
+    """Callback of an option from a function of its value alone."""
+    return lambda _context, _given, value: function(value)
 
 
 DEBUG = option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
@@ -41,34 +60,31 @@ def _with_formats(
     return *files, *context.meta.get(_FORMATS, ())
 
 
+_TOML = option(
+    "--columns",
+    type=LOGS,
+    multiple=True,
+    callback=_with_formats,
+    metavar="TOML",
+    help="Declares the columns of a log that is in no known format; may be repeated.",
+)
+_NAME = option(
+    "--format",
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_name_formats,
+    metavar="NAME",
+    help="Format of a log that is not recognised, such as tum; may be repeated.",
+)
+
+
 def COLUMNS(command: Callable) -> Callable:
     """Options that name the columns of a log in an unknown format."""
-    for one in (
-        option(
-            "--columns",
-            type=LOGS,
-            multiple=True,
-            callback=_with_formats,
-            metavar="TOML",
-            help="Declares the columns of a log that is in no known format; may be repeated.",
-        ),
-        option(
-            "--format",
-            multiple=True,
-            is_eager=True,
-            expose_value=False,
-            callback=_name_formats,
-            metavar="NAME",
-            help="Format of a log that is not recognised, such as tum; may be repeated.",
-        ),
-    ):
-        command = one(command)
-    return command
+    return _NAME(_TOML(command))
 
 
-def _confirm(
-    _context: click.Context, _given: click.Parameter, files: tuple[Path, ...]
-) -> tuple[Path, ...]:
+def _confirm(files: tuple[Path, ...]) -> tuple[Path, ...]:
     """Confirm files of user code before the command reads files that name them."""
     if files:
         from robins.systems import trust
@@ -81,7 +97,7 @@ def _confirm(
 MACHINE = option(
     "--machine",
     type=click.Choice(["vm", "c", "jax"]),
-    callback=lambda _context, _given, name: name or "",
+    callback=of_value(lambda name: name or ""),
     help="What computes: an interpreter at once, compiled C, or JAX. [default: vm]",
 )
 TRUST = option(
@@ -90,7 +106,7 @@ TRUST = option(
     multiple=True,
     is_eager=True,
     expose_value=False,
-    callback=_confirm,
+    callback=of_value(_confirm),
     metavar="FILE",
     help="Let this code run, which a file names; remembered until it changes. May be repeated.",
 )
@@ -106,7 +122,7 @@ def publishes(command: Callable) -> Callable:
     return OUT(answers(command))
 
 
-def as_names(_context: click.Context, _given: click.Parameter, text: str | None) -> tuple[str, ...]:
+def as_names(text: str | None) -> tuple[str, ...]:
     """Names separated by commas."""
     if text is None:
         return ()
@@ -116,9 +132,7 @@ def as_names(_context: click.Context, _given: click.Parameter, text: str | None)
     return names
 
 
-def as_settings(
-    _context: click.Context, _given: click.Parameter, texts: tuple[str, ...]
-) -> tuple[str, ...]:
+def as_settings(texts: tuple[str, ...]) -> tuple[str, ...]:
     """Settings, each key=value."""
     for text in texts:
         key, equals, _ = text.partition("=")
@@ -131,19 +145,20 @@ SETTINGS = option(
     "--set",
     "settings",
     multiple=True,
-    callback=as_settings,
+    callback=of_value(as_settings),
     metavar="key=value",
     help="Change a parameter, with its unit; may be repeated.",
 )
 
 
 SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise.")
-FILTERS = option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare.")
+_FILTERS: dict[str, Any] = {"metavar": "a,b", "help": "Which filters to compare."}
+FILTERS = option("--filters", callback=of_value(as_names), **_FILTERS)
 
 
-def _one_filter(context: click.Context, given: click.Parameter, text: str | None) -> str:
+def _one_filter(text: str | None) -> str:
     """Name of one filter; empty where none is given."""
-    filters = as_names(context, given, text)
+    filters = as_names(text)
     if len(filters) > 1:
         raise InputError(
             "a bound is that of one model", f"--filters {','.join(filters)}", "name one."
@@ -151,13 +166,7 @@ def _one_filter(context: click.Context, given: click.Parameter, text: str | None
     return "".join(filters)
 
 
-FILTER = option(
-    "--filters",
-    "filter_name",
-    callback=_one_filter,
-    metavar="a,b",
-    help="Which filters to compare.",
-)
+FILTER = option("--filters", "filter_name", callback=of_value(_one_filter), **_FILTERS)
 
 
 def choices(command: Callable) -> Callable:

@@ -110,7 +110,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return ExitStatus.FAILED
             if "--debug" in given and not isinstance(error, click.ClickException):
                 traceback.print_exception(error)
-            return _report_error(error)
+            text, status = _described(error)
+            _print_error(text)
+            return status
 
 
 def _interrupted(for_good: bool) -> ExitStatus:
@@ -135,35 +137,31 @@ def _leave(status: ExitStatus) -> NoReturn:
     os._exit(status)
 
 
-def _report_error(error: Exception) -> ExitStatus:
-    """Report an error in a few lines, and return its exit status."""
+def _described(error: Exception) -> tuple[str, ExitStatus]:
+    """Error in a few lines, and its exit status."""
+    bad_input = False
     if isinstance(error, click.UsageError):
-        _print_error(error.format_message())
         command = error.ctx.command_path if error.ctx else "robins"
-        _print_error(f"`{command} --help` lists what can be given.")
-        return ExitStatus.BAD_INPUT
-    if isinstance(error, click.ClickException):
-        _print_error(error.format_message())
-        return ExitStatus(error.exit_code)
-    if isinstance(error, RobinsError):
-        _print_error(str(error))
-        return ExitStatus.BAD_INPUT if error.bad_input else ExitStatus.FAILED
-    if isinstance(error, ModuleNotFoundError) and error.name in _OF_THE_BENCH:
-        _print_error(
-            f"the bench needs the extra 'bench': pip install 'robins[bench]' ({error.name} is "
-            "missing)"
-        )
-        return ExitStatus.BAD_INPUT
-    if isinstance(error, MemoryError):
-        _print_error("out of memory; ask for fewer runs or filters at a time.")
-        return ExitStatus.FAILED
-    if isinstance(error, OSError) and error.filename is not None:
-        _print_error(f"{os.fsdecode(error.filename)}: {error.strerror}; choose another path.")
-        return ExitStatus.BAD_INPUT if error.errno in _OF_A_PATH else ExitStatus.FAILED
-    first = (str(error).strip().splitlines() or [""])[0]
-    _print_error(f"failed: {type(error).__name__}: {first}")
-    _print_error("this may be a fault of robins; run it again with --debug to see where.")
-    return ExitStatus.FAILED
+        text = f"{error.format_message()}\n`{command} --help` lists what can be given."
+        bad_input = True
+    elif isinstance(error, click.ClickException):
+        return error.format_message(), ExitStatus(error.exit_code)
+    elif isinstance(error, RobinsError):
+        text, bad_input = str(error), error.bad_input
+    elif isinstance(error, ModuleNotFoundError) and error.name in _OF_THE_BENCH:
+        install = "pip install 'robins[bench]'"
+        text = f"the bench needs the extra 'bench': {install} ({error.name} is missing)"
+        bad_input = True
+    elif isinstance(error, MemoryError):
+        text = "out of memory; ask for fewer runs or filters at a time."
+    elif isinstance(error, OSError) and error.filename is not None:
+        text = f"{os.fsdecode(error.filename)}: {error.strerror}; choose another path."
+        bad_input = error.errno in _OF_A_PATH
+    else:
+        first = (str(error).strip().splitlines() or [""])[0]
+        text = f"failed: {type(error).__name__}: {first}\n"
+        text += "this may be a fault of robins; run it again with --debug to see where."
+    return text, ExitStatus.BAD_INPUT if bad_input else ExitStatus.FAILED
 
 
 def _print_error(text: str) -> None:

@@ -120,9 +120,9 @@ def _arrays(sensor: str, curve: Allan, fitted: AllanFit | None, body: str) -> di
     return made
 
 
-def _metrics(sensor: str, fitted: AllanFit) -> dict[str, dict[str, Any]]:
+def _metrics(sensor: str, fitted: AllanFit) -> dict[str, dict[str, float | list[float]]]:
     """Parameters and their intervals by axis."""
-    by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
+    by_axis: dict[str, dict[str, float | list[float]]] = {axis: {} for axis in _AXES}
     for name, found in in_field_units(fitted, sensor).items():  # type: ignore[arg-type]
         unit = units.as_ending(found.unit)
         for k, axis in enumerate(_AXES):

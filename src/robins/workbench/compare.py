@@ -8,7 +8,7 @@ Examples::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,9 @@ import numpy as np
 from robins import results, scenario
 from robins.results import Probability
 from robins.workbench.options import Option, Where
+
+Differing = dict[str, tuple[Any, Any]]
+"""What two results have under one name, by name."""
 
 
 class Comparison(NamedTuple):
@@ -31,14 +34,14 @@ class Comparison(NamedTuple):
     """
 
     scenarios: tuple[Any, Any]
-    asked: dict[str, tuple[Any, Any]]
-    versions: dict[str, tuple[Any, Any]]
-    metrics: dict[str, dict[str, tuple[Any, Any]]]
+    asked: Differing
+    versions: Differing
+    metrics: dict[str, Differing]
     missing: tuple[list[str], list[str]]
-    claims: dict[str, tuple[Any, Any]]
+    claims: Differing
 
     @property
-    def changed(self) -> dict[str, dict[str, tuple[Any, Any]]]:
+    def changed(self) -> dict[str, Differing]:
         """The metrics that differ."""
         return {
             name: differ
@@ -80,7 +83,7 @@ def compare(
     )
 
 
-def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> Differing:
     return {k: (a.get(k), b.get(k)) for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)}
 
 
@@ -95,7 +98,7 @@ def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
     return found
 
 
-def ratios(pair: tuple[Any, Any]) -> list[float]:
+def ratios(pair: Sequence[Any]) -> list[float]:
     """The second over the first, of each component; NaN where one is no number."""
     a, b = (np.atleast_1d(np.array(Probability.share_of(x), dtype=object)) for x in pair)
     if a.shape != b.shape:

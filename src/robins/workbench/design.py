@@ -8,8 +8,6 @@ Examples::
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -17,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from robins.filters.synthesis import METHODS, Attempt, Design, TradeOff, trade_off
+from robins.report.numbers import csv_of
 from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.results.summary import dumps, plain
 from robins.workbench.design_problem import DesignProblem, read_problem
@@ -44,9 +43,9 @@ def cell(attempt: Attempt) -> str:
     return "not certified"
 
 
-def metrics_of(found: TradeOff) -> dict[str, dict[str, Any]]:
+def metrics_of(found: TradeOff) -> dict[str, dict[str, float | str | None]]:
     """Norms by method and gamma."""
-    columns: dict[str, dict[str, Any]] = {
+    columns: dict[str, dict[str, float | str | None]] = {
         "kalman": {"h2": found.kalman.h2, "hinf": found.kalman.hinf}
     }
     for gamma, text in zip(found.gammas, as_text(found.gammas), strict=True):
@@ -113,16 +112,14 @@ def _design_row(name: str, design: Design) -> dict[str, Any]:
     return row | {"status": design.status}
 
 
-def table_of(found: TradeOff) -> str:
+def table_of(found: TradeOff) -> bytes:
     """The curve as CSV, a row for each method and gamma."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", "gamma", *(n.rstrip("_") for n in _NUMBERS), "not_reached"])
+    rows = [["method", "gamma", *(n.rstrip("_") for n in _NUMBERS), "not_reached"]]
     kalman = Attempt("kalman", np.inf, found.kalman, "", np.nan)
     for o in (kalman, *found.attempts):
         numbers = [repr(float(getattr(o.design, n))) if o.design else "" for n in _NUMBERS]
-        writer.writerow([o.method, repr(o.gamma), *numbers, o.why])
-    return text.getvalue()
+        rows.append([o.method, repr(o.gamma), *numbers, o.why])
+    return csv_of(rows)
 
 
 def advice(problem: DesignProblem, found: TradeOff) -> list[str]:
@@ -224,7 +221,7 @@ def design(
         metrics_of(found),
         files={
             GAINS: dumps(plain(gains_of(problem, found))).encode(),
-            TABLE: table_of(found).encode(),
+            TABLE: table_of(found),
         },
         notes=advice(problem, found),
         scenario=f"design/{problem.name}",

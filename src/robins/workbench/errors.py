@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 
 from robins.errors import RobinsError
@@ -13,7 +14,7 @@ class InputError(RobinsError, ValueError):
 
 
 @contextlib.contextmanager
-def refusing(what: object) -> Iterator[None]:
+def refusing(what: str | os.PathLike[str]) -> Iterator[None]:
     """Raise a ValueError as an InputError that names what it is about.
 
     Raises:

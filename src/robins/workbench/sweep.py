@@ -174,21 +174,16 @@ def _sweep_request(where: Where) -> tuple[list[SweptParameter], list[SweepPoint]
     return chosen, list(points(where, chosen))
 
 
-class RmsBounds(NamedTuple):
-    """RMS error of a filter and a block at one point, over runs and epochs, with 95 % bounds."""
+_FIGURES = ("rms", "low", "high", "stated")
 
-    rms: float
-    low: float
-    high: float
-    stated: float  # root of the mean variance that the filter states
 
-    @classmethod
-    def of(cls, found: Statistics, block: StateBlock) -> RmsBounds:
-        """RMS of the length of the error over the components of a block, in SI."""
-        squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
-        stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
-        rms, low, high = (float(one) for one in rms_with_bounds(squares))
-        return cls(rms, low, high, float(np.sqrt(np.mean(stated))))
+def _figures(found: Statistics, block: StateBlock) -> list[float]:
+    """RMS length of the error of a block over runs and epochs, its 95 % bounds, and the root of the
+    mean variance that the filter states; in SI.
+    """
+    squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
+    stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
+    return [*map(float, rms_with_bounds(squares)), float(np.sqrt(np.mean(stated)))]
 
 
 def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Outcome:
@@ -198,7 +193,7 @@ def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Out
     blocks = problem_of(plan).blocks
     sizes = (*(len(v.values) for v in vary), 1)[:2]
     shape = (len(plan.filters), *sizes)
-    figures = {b.name: np.full((*shape, len(RmsBounds._fields)), np.nan) for b in blocks}
+    figures = {b.name: np.full((*shape, len(_FIGURES)), np.nan) for b in blocks}
     rows: list[list[Any]] = []
     lost: dict[str, int] = dict.fromkeys(plan.filters, 0)
     for point in every:
@@ -210,12 +205,12 @@ def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Out
                 raise InputError(f"has no run of '{filter_}' yet", point.where, "run it again.")
             lost[filter_] += one.diverged
             for b in blocks:
-                figure = RmsBounds.of(one, b)
+                figure = _figures(one, b)
                 figures[b.name][(f, *(*point.place, 0)[:2])] = figure
                 shown = [units.convert(x, b.units, b.display_unit) for x in figure]
                 values = [v.values[k] for v, k in zip(vary, point.place, strict=True)]
                 rows.append([filter_, *values, b.name, b.display_unit, *shown, one.runs])
-    head = ["filter", *(v.key for v in vary), "block", "unit", *RmsBounds._fields, "runs"]
+    head = ["filter", *(v.key for v in vary), "block", "unit", *_FIGURES, "runs"]
     first = problem_of(plan)
     return Outcome(
         solution=_solution(plan, vary, blocks, figures),
@@ -254,7 +249,7 @@ def _solution(
         data[f"sweep_{k}"] = xr.Variable(f"sweep_{k}", numbers, about)
     for b in blocks:
         about = {"unit": b.units, "display_unit": b.display_unit}
-        for place, role in enumerate(("rms", "low", "high", "stated")):
+        for place, role in enumerate(_FIGURES):
             more: dict[str, Any] = {"runs": plan.runs} if role == "rms" else {}
             values = figures[b.name][..., place]
             data |= array(f"sweep_{role}", values, b.name, **about, **more)

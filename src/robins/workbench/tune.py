@@ -175,10 +175,10 @@ def _change(of: TuningRequest, found: Tuned) -> str:
     return f"{of.by} {less:+.2f} % (at most {least:+.2f} % at 95 %), {over}"
 
 
-def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, Any]:
+def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, float]:
     """Figures of the data held out: log density, and by block RMS error and stated over it."""
     mean = np.mean(parts, axis=0)
-    out: dict[str, Any] = {"log_density": float(mean[DENSITY] / mean[COMPONENTS])}
+    out: dict[str, float] = {"log_density": float(mean[DENSITY] / mean[COMPONENTS])}
     n = len(of.blocks)
     for b, square, variance in zip(
         of.blocks, mean[FIRST_BLOCK:][:n], mean[FIRST_BLOCK:][n:], strict=True
@@ -192,8 +192,10 @@ def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, Any]:
 
 def _table(
     of: TuningRequest, bands: Sequence[tuple[float, float, float]], now: Sequence[str]
-) -> Sequence[Sequence[Any]]:
-    rows: list[Sequence[Any]] = [("parameter", "as written", "factor", "low", "high", "now")]
+) -> Sequence[Sequence[str | float]]:
+    rows: list[Sequence[str | float]] = [
+        ("parameter", "as written", "factor", "low", "high", "now")
+    ]
     for v, band, line in zip(of.vary, bands, now, strict=True):
         was = scenario.setting(v.key, v.start).partition("=")[2]
         rows.append((v.key, was, *band, line.partition("=")[2]))

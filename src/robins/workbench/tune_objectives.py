@@ -22,7 +22,7 @@ from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import Blocks, blocks_of, one_record
 from robins.campaign.sensitivity import course_differs
 from robins.campaign.tuning import Data, Objective, Tree, Trial, UndeterminedError
-from robins.filters import Filter, run
+from robins.filters import Filter, Model, run
 from robins.filters.analysis.predictive import predicted, scored
 from robins.filters.values import as_data, content, kind, value
 from robins.results import Progress
@@ -287,7 +287,7 @@ def _components(y: Tree, dim: int) -> int:
     return int(np.sum(np.minimum(each, dim)))
 
 
-def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
+def _steps(filter_: Filter, model: Model, given: Sequence[Sequence[Any]]) -> Array:
     """(E, 2) log density of the measurements of each step of all pieces, and their components."""
     rows = []
     for start, y, u, aux in given:

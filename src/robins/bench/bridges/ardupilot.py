@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, finite, vector
+from robins.bench.closing import Closing
 
 PORT = 9002
 MAGIC = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
@@ -147,7 +148,7 @@ class ArduPilotCounts:
     strangers: int = 0  # datagrams of an address that is not that of the autopilot
 
 
-class ArduPilotPhysics:
+class ArduPilotPhysics(Closing):
     """UDP socket that ArduPilot sends to; closes as a context manager. For one thread.
 
     Attributes:
@@ -185,12 +186,6 @@ class ArduPilotPhysics:
         self._declared, self._active = peer, 0.0  # time of the last packet or answer
         self._answer = b""  # to it; empty: none yet
         self._waiting: deque[tuple[bytes, Address]] = deque()
-
-    def __enter__(self) -> ArduPilotPhysics:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop listening. May be repeated."""

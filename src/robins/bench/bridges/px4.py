@@ -24,6 +24,7 @@ from typing import Any
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, BridgeTimeout
 from robins.bench.bridges.px4_messages import Actuators, Px4Sample, Sensors, dialect, message
+from robins.bench.closing import Closing
 from robins.foreign import decoding
 
 PORT = 4560
@@ -44,7 +45,7 @@ class Px4Counts:
     strangers: int = 0  # connections of another machine, closed at once
 
 
-class Px4Simulator:
+class Px4Simulator(Closing):
     """TCP server that PX4 connects to; closes as a context manager. For one thread.
 
     Attributes:
@@ -81,12 +82,6 @@ class Px4Simulator:
         self._mav: Any = None
         self._waiting: deque[Actuators] = deque()
         self._answers = False
-
-    def __enter__(self) -> Px4Simulator:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def connected(self) -> bool:
@@ -250,6 +245,6 @@ class Px4Simulator:
             raise BridgeClosed("PX4 is not connected", self._where, "call accept()")
         return self._line
 
-    def _gone(self, why: object) -> BridgeClosed:
+    def _gone(self, why: OSError | str) -> BridgeClosed:
         self.hang_up()
         return BridgeClosed(f"PX4 has gone: {why}", self._where, "accept() waits for it again")

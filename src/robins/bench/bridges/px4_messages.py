@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,7 +128,7 @@ class Actuators(NamedTuple):
         return bool(self.flags & 1)
 
 
-def dialect() -> Any:
+def dialect() -> ModuleType:
     """Import pymavlink's module of MAVLink's common set.
 
     Raises:

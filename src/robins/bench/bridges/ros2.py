@@ -32,6 +32,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, needed
+from robins.bench.closing import Closing
 from robins.ros import Message, RosError, Stamped, decode, encode, name_of
 
 DISTRO = "jazzy"  # distribution of ROS 2 whose definitions are hashed
@@ -95,7 +96,7 @@ def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
     return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
 
 
-class Ros2Topics:
+class Ros2Topics(Closing):
     """A session of Zenoh with publishers and subscribers of ROS topics; closes as a context.
 
     Attributes:
@@ -154,12 +155,6 @@ class Ros2Topics:
         self._kinds: dict[str, type[Message]] = {}
         self._sequence = 0
         self._gid = uuid.uuid4().bytes
-
-    def __enter__(self) -> Ros2Topics:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the session with all its publishers and subscribers. May be repeated."""

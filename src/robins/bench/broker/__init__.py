@@ -6,7 +6,7 @@
 - `restart`: sends a restarted part its input again. `console`: messages of the operator.
 """
 
-from robins.bench.broker.broker import Broker, Wiring
+from robins.bench.broker.broker import Broker
 from robins.bench.broker.faults import DeviceFault, FaultTable, LinkFault
 from robins.bench.broker.injector import Injector, LineOutput
 from robins.bench.broker.link import BenchError, Health, Link, LinkLost
@@ -23,7 +23,6 @@ __all__ = [
     "Link",
     "LinkFault",
     "LinkLost",
-    "Wiring",
 ]
 
 __getattr__ = moved(__name__)

@@ -13,43 +13,20 @@ import select
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from robins.bench.broker.console import OperatorMessageError
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Link, LinkLost
 from robins.bench.broker.restart import SentFrames, beginning, catch_up
+from robins.bench.rig import Rig
 from robins.bench.wire.frames import Frame
-from robins.bench.wire.schema import BARE, Wire
+from robins.bench.wire.schema import BARE
 
-Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, each with its lag in steps
 _REMEMBERED = 64  # steps for which repeated messages are recognised
 _REPORT_S = 10.0  # period of reports on the parts that are waited for
 _POLL_S = 0.05  # period of polling everything but the lines while nothing comes
 _CLOCK_NS = time.monotonic_ns
-
-
-class Wiring(NamedTuple):
-    """Senders and receivers of each message."""
-
-    wire: Wire
-    sends: Sends
-    takes: Takes
-    console: tuple[str, ...] = ()  # messages that the bench itself sends
-
-    def sources(self, part: str) -> frozenset[str]:
-        """Parts that must be done before this one may compute."""
-        wanted = {name for name, lag in self.takes[part].items() if lag == 0}
-        return frozenset(p for p, sent in self.sends.items() if wanted & set(sent))
-
-    def takers(self, message: str) -> tuple[str, ...]:
-        """Parts that take a message."""
-        return tuple(p for p, taken in self.takes.items() if message in taken)
-
-    def lag(self, message: str) -> int:
-        """Greatest lag [steps] with which a part takes a message."""
-        return max((taken.get(message, 0) for taken in self.takes.values()), default=0)
 
 
 class Broker:
@@ -65,7 +42,8 @@ class Broker:
     def __init__(
         self,
         links: Mapping[str, Link],
-        wiring: Wiring,
+        rig: Rig,
+        takes: Takes,
         step_ns: int,
         injector: Injector,
         observe: Callable[[str, int, bytes], None],
@@ -80,7 +58,8 @@ class Broker:
 
         Args:
             links: by part.
-            wiring: senders and receivers of each message.
+            rig: with its messages and their senders.
+            takes: messages that each part takes.
             step_ns: length of a step.
             injector: the faults that the links have.
             observe: called with each message that passes: name, time [ns], payload.
@@ -94,7 +73,8 @@ class Broker:
             waiting: called with the parts whose hello is missing, and the waiting time [s]: when
                 the parts change, and now and then.
         """
-        self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
+        self.links, self.step_ns = dict(links), step_ns
+        self._wire, self._takes, self._console = rig.wire, takes, rig.console
         self.time_ns = 0
         self.silent = dict.fromkeys(links, 0)
         self.off: set[str] = set()
@@ -102,14 +82,14 @@ class Broker:
         self._injector, self._observe = injector, observe
         self._poll, self._answered_by, self._meanwhile = poll_processes, done, meanwhile
         self._idle_s, self._waiting = idle_s, waiting
-        self._sources = {p: wiring.sources(p) & set(links) for p in links}
-        self._takers = {
-            name: tuple(p for p in wiring.takers(name) if p in links)
-            for sent in (*wiring.sends.values(), wiring.console)
-            for name in sent
-        }
-        self._lags = {name: wiring.lag(name) for p in links for name in wiring.sends[p]}
-        self._sends = {p: frozenset(wiring.sends[p]) for p in links}
+        self._sends = {p: frozenset(rig.sends[p]) for p in links}
+        now = {p: {name for name, lag in takes[p].items() if lag == 0} for p in links}
+        # parts that must be done before each may compute
+        self._sources = {p: {q for q in links if now[p] & self._sends[q]} for p in links}
+        every = [name for sent in (*rig.sends.values(), rig.console) for name in sent]
+        self._takers = {name: [p for p in links if name in takes[p]] for name in every}
+        lags = {name: [taken.get(name, 0) for taken in takes.values()] for name in every}
+        self._lags = {name: max(each, default=0) for name, each in lags.items()}  # the greatest
         self._kept = dict(keep or {})
         self._routed: dict[int, set[str]] = {}  # messages passed, by time, of the last steps
         self._ticked: dict[str, tuple[int, int]] = {}  # first and last sent [ns of wall clock]
@@ -154,7 +134,7 @@ class Broker:
             self.poll(_POLL_S)
 
     def _greet(self, name: str, frame: Frame) -> None:
-        link, said, wire = self.links[name], BARE.decode("hello", frame.payload), self.wiring.wire
+        link, said, wire = self.links[name], BARE.decode("hello", frame.payload), self._wire
         if said["schema"] != wire.number:
             raise BenchError(
                 f"'{name}' speaks another version of the wire (schema {said['schema']:#010x}, "
@@ -253,9 +233,9 @@ class Broker:
             OperatorMessageError: the bench does not send this message, or a number is beyond its
                 limits.
         """
-        if message not in self.wiring.console:
+        if message not in self._console:
             raise OperatorMessageError(f"message: the bench does not say '{message}'")
-        if why := self.wiring.wire.unsound(message, payload):
+        if why := self._wire.unsound(message, payload):
             raise OperatorMessageError(f"message '{message}': {why.text}")
         self._observe(message, self.time_ns, payload)
         for taker in self._takers[message]:
@@ -381,7 +361,7 @@ class Broker:
         self._routed.setdefault(at, set()).add(message)
         self._observe(message, at, payload)
         for taker in self._takers[message]:
-            if taker in self.off or age > self.wiring.takes[taker][message]:
+            if taker in self.off or age > self._takes[taker][message]:
                 continue
             link = self.links[taker]
             self._put(link, message, payload, at)

@@ -65,7 +65,7 @@ class Console(NamedTuple):
         return payload
 
 
-def _blank(f: Field) -> Any:
+def _blank(f: Field) -> list[float | int]:
     nothing = float("nan") if f.missing else 0
     return [nothing] * f.length
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import pydantic
@@ -32,6 +32,8 @@ _LINE: dict[str, tuple[str, ...]] = {
 }
 """Faults of the line and of processes, with the parameters of each."""
 _NEEDS = {"delay": "delay", "killed": "link", "power": "link"}
+ParameterTable = Mapping[str, tuple[Any, Any]]
+"""Parameters that a rig adds, by name: type and default."""
 PROCESS = ("killed", "power")
 """Faults of processes, which do not act on frames."""
 
@@ -56,7 +58,11 @@ class DeviceFault(NamedTuple):
     needs: str = ""
 
 
-def nothing(said: Values, fault: Any, now_ns: int) -> Values:
+DeviceFaults = tuple[Mapping[str, DeviceFault], ParameterTable]
+"""Faults of the sensors and actuators of a rig, by kind, and their parameters."""
+
+
+def nothing(said: Values, fault: LinkFault, now_ns: int) -> Values:
     """Values of a sensor without a measurement: NaN for every number."""
     return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
 
@@ -106,6 +112,10 @@ class LinkFault(Parameters):
     """
 
     table: ClassVar[FaultTable] = FaultTable()
+
+    if TYPE_CHECKING:  # parameters that a rig adds, see `faults_of`
+
+        def __getattr__(self, name: str) -> Any: ...
 
     kind: str
     begin: Annotated[float, Quantity("time", least="0 s")]
@@ -160,7 +170,7 @@ class LinkFault(Parameters):
         return self.begin_ns <= now_ns < self.end_ns
 
 
-def faults_of(table: FaultTable, **more: Any) -> type[LinkFault]:
+def faults_of(table: FaultTable, more: ParameterTable) -> type[LinkFault]:
     """The faults of a rig as parameters.
 
     Args:

@@ -10,11 +10,12 @@ import math
 import os
 import select
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 from robins.bench.broker.link import BenchError, Link
 from robins.bench.parts.station import is_due
-from robins.bench.wire.frames import Header, encode_frame
+from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.schema import BARE, NUMBERS
 
@@ -82,13 +83,33 @@ def catch_up(
         BenchError: it does not answer.
         OSError: the far end is gone.
     """
-    talk = _Dialogue(link, patience_s, poll_processes, idle_s)
-    talk.until("hello", None)
-    talk.say(begin)
+    receiver, came = Receiver(), deque[Frame]()
+
+    def await_frame(name: str, step: int | None = None) -> None:
+        began = time.monotonic()
+        while True:
+            while came:
+                frame = came.popleft()
+                if frame.header.type == NUMBERS[name] and (
+                    step is None or BARE.decode(name, frame.payload)["step"] == step
+                ):
+                    return
+            if min(time.monotonic() - began, idle_s()) > patience_s:
+                what = name if step is None else f"answer to the tick of step {step}"
+                raise BenchError(
+                    f"'{link.name}' was restarted, but there is no {what} from it in "
+                    f"{patience_s:g} s"
+                )
+            poll_processes()
+            if select.select([link.fd], [], [], 0.05)[0]:
+                came.extend(receiver.feed(os.read(link.fd, 65536)))
+
+    await_frame("hello")
+    _write(link.fd, begin)
     for step, raw in sent_frames:
-        talk.say(raw)
+        _write(link.fd, raw)
         if step is not None and step <= answered:
-            talk.until("done", step)
+            await_frame("done", step)
 
 
 def beginning(run: int, step_ns: int) -> bytes:
@@ -98,43 +119,10 @@ def beginning(run: int, step_ns: int) -> bytes:
     )
 
 
-class _Dialogue:
-    def __init__(
-        self,
-        link: Link,
-        patience_s: float,
-        poll_processes: Callable[[], None],
-        idle_s: Callable[[], float],
-    ):
-        self._link, self._patience_s = link, patience_s
-        self._poll, self._idle_s = poll_processes, idle_s
-        self._receiver = Receiver()
-        self._come: list[tuple[int, bytes]] = []
-
-    def say(self, raw: bytes) -> None:
-        while raw:
-            try:
-                raw = raw[os.write(self._link.fd, raw) :]
-            except BlockingIOError:
-                select.select([], [self._link.fd], [], 0.05)
-
-    def until(self, name: str, step: int | None) -> None:
-        """Read until a message has come, of a step if that is given."""
-        began = time.monotonic()
-        while True:
-            while self._come:
-                number, payload = self._come.pop(0)
-                if number == NUMBERS[name] and (
-                    step is None or BARE.decode(name, payload)["step"] == step
-                ):
-                    return
-            if min(time.monotonic() - began, self._idle_s()) > self._patience_s:
-                what = name if step is None else f"answer to the tick of step {step}"
-                raise BenchError(
-                    f"'{self._link.name}' was restarted, but there is no {what} from it in "
-                    f"{self._patience_s:g} s"
-                )
-            self._poll()
-            if select.select([self._link.fd], [], [], 0.05)[0]:
-                for frame in self._receiver.feed(os.read(self._link.fd, 65536)):
-                    self._come.append((frame.header.type, frame.payload))
+def _write(fd: int, raw: bytes) -> None:
+    """Write all bytes to a port that may be full."""
+    while raw:
+        try:
+            raw = raw[os.write(fd, raw) :]
+        except BlockingIOError:
+            select.select([], [fd], [], 0.05)

@@ -18,11 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import IntEnum
 from itertools import groupby
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 
 JsonObject = dict[str, Any]
+EventT = TypeVar("EventT")
 Role = Literal["value", "sigma", "limit", "attitude"]
 
 
@@ -157,7 +158,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) -> list[Any]:
+def latest(events: Sequence[EventT], kind: Callable[[EventT], Hashable], most: int) -> list[EventT]:
     """Latest events up to a number, in their order.
 
     Each kind has an equal share of the room, and the others use what it leaves; so a thousand

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from robins.bench.closing import Closing
 from robins.bench.live import feed
 from robins.bench.live.events import Events
 from robins.bench.live.feed import FrameKind, JsonObject, Signal, as_json, check
@@ -30,7 +31,7 @@ SEND_BUFFER = 1 << 16  # bytes in the kernel for a browser that does not read
 Level = Literal["info", "warning", "alarm"]
 
 
-class LivePage:
+class LivePage(Closing):
     """A page that shows a running bench, served by another process.
 
     The server has its own session, so Ctrl-C leaves it to the bench to end it, and it ends by
@@ -221,12 +222,6 @@ class LivePage:
             self._closed = True
             self._end(kill=False)
             self._at.close()
-
-    def __enter__(self) -> LivePage:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # --------------------------------------------------------------------------------------- inside
 

@@ -24,6 +24,8 @@ import serial
 from serial.tools import list_ports as system
 from serial.tools.list_ports_common import ListPortInfo
 
+from robins.bench.closing import Closing
+from robins.bench.status import aligned
 from robins.errors import RobinsError
 
 BAUD = 460800
@@ -132,7 +134,7 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
 
 
 @dataclass
-class Pair:
+class Pair(Closing):
     """Two ends of a pseudo-terminal, as a cable between bench and part; closes as a context.
 
     Attributes:
@@ -152,12 +154,6 @@ class Pair:
             if end >= 0:
                 os.close(end)
         self.master = self.slave = -1
-
-    def __enter__(self) -> Pair:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_pair() -> Pair:
@@ -233,11 +229,7 @@ def table(ports: Sequence[PortInfo]) -> str:
         (p.path, p.description, p.manufacturer, p.serial_number, "yes" if p.usable else "no")
         for p in ports
     ]
-    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in (head, *rows)
-    ]
+    lines = aligned([head, *rows])
     lines += [f"{p.path}: {p.why}" for p in ports if not p.usable]
     usable = [p for p in ports if p.usable]
     if usable:

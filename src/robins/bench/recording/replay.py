@@ -13,6 +13,7 @@ import select
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -189,24 +190,20 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
 # --------------------------------------------------------------------------------------- the part
 
 
+@dataclass
 class _Replay:
     """Replay of one lifetime of a part, from start to exit."""
 
-    def __init__(
-        self,
-        wire: Wire,
-        part: str,
-        pair: Pair,
-        process: Any,
-        patience_s: float,
-        life: _PartLifetime,
-    ):
-        self._wire, self._part, self._pair, self._process = wire, part, pair, process
-        self._patience_s, self._life = patience_s, life
-        self._idle_s = idleness()
-        self._receiver = Receiver()
-        self._waiting: list[Frame] = []
-        self._where = "before its hello"
+    _wire: Wire
+    _part: str
+    _pair: Pair
+    _process: Any
+    _patience_s: float
+    _life: _PartLifetime
+    _idle_s: Callable[[int | None], float] = field(default_factory=idleness)
+    _receiver: Receiver = field(default_factory=Receiver)
+    _waiting: list[Frame] = field(default_factory=list)
+    _where: str = "before its hello"
 
     def run(self, rows: Iterable[_LinkRow], count: Callable[[], None]) -> None:
         """Send the part its recorded input; pass recorded and new answers to the comparison."""
@@ -235,7 +232,7 @@ class _Replay:
         hello = self._next()
         while hello.header.type != _HELLO:
             hello = self._next()
-        number = int(self._value("hello", hello, "part"))
+        number = self._value("hello", hello, "part")
         parts, known = self._wire.parts, self._wire.number
         name = parts[number] if number < len(parts) else f"number {number}"
         if name != self._part:
@@ -261,9 +258,9 @@ class _Replay:
             if kind >= FIRST_DATA:
                 said.append(frame)
 
-    def _value(self, name: str, frame: Frame, field: str) -> Any:
+    def _value(self, name: str, frame: Frame, number: str) -> int:
         try:
-            return BARE.decode(name, frame.payload)[field]
+            return BARE.decode(name, frame.payload)[number]
         except RecordError as error:
             raise ReplayError(f"part '{self._part}', {self._where}: {error}") from None
 
@@ -379,15 +376,16 @@ class _PartLifetime:
     def first_difference(self) -> str | None:
         """First frame that differs, in words; call it at the end."""
         for number, frame in self._then.items():
-            place_text = f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
-            self._differs(number, f"{place_text} was recorded and is not said now")
+            self._differs(number, f"{self._text(frame)} was recorded and is not said now")
         # a truncated record, or a part that died, ends in the middle of an answer
         whole = self._tick <= self._answered
         for number, frame in self._now.items():
             if whole or number < self._newest:
-                place_text = f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
-                self._differs(number, f"{place_text} is said now and was not recorded")
+                self._differs(number, f"{self._text(frame)} is said now and was not recorded")
         return None if self._first is None else self._first[1]
+
+    def _text(self, frame: Frame) -> str:
+        return f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
 
 
 def _in_words(wire: Wire, life: _PartLifetime, then: Frame, now: Frame) -> str:

@@ -24,6 +24,7 @@ from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
+from robins.bench.closing import Closing
 from robins.bench.recording import layout
 from robins.bench.recording.topics import Topic, Topics
 from robins.bench.wire.frames import VERSION, FrameError, decode_frame
@@ -34,7 +35,7 @@ CHUNK_BYTES = 65536
 CHUNK_NS = 250_000_000
 
 
-class Recorder:
+class Recorder(Closing):
     """Writer of a record; a context manager that closes it.
 
     Attributes:
@@ -92,12 +93,6 @@ class Recorder:
         except OSError:
             self._disk.close()
             raise
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def write(self, entry: layout.Entry, time_ns: int | None = None) -> None:
         """Take an entry: a frame or bytes that went over a link.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.evaluation import OperatorEvent
@@ -84,11 +86,7 @@ class Orders:
 
 def in_words(message: str, values: Values) -> str:
     """Text of an operator message for the user."""
-    pairs = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
+    pairs = ((name, np.ravel(value).tolist()) for name, value in values.items())
     return f"'{message}': " + "; ".join(
         f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in pairs
     )
-
-
-def _flat(value: Any) -> Any:
-    return value if hasattr(value, "__len__") else [value]

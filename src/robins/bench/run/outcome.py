@@ -11,7 +11,7 @@ import xarray as xr
 
 from robins.bench.broker.link import BenchError
 from robins.bench.evaluation import MessageSeries, RunFigures, RunResult, arrays_of
-from robins.bench.live.feed import latest
+from robins.bench.live.feed import JsonObject, latest
 from robins.bench.ports.port import program
 from robins.bench.rig import LoadedRun
 from robins.bench.run.setup import calling
@@ -55,7 +55,7 @@ def in_one_program(flight: LoadedRun, result: RunResult) -> Mapping[str, np.ndar
 
 def figures(
     flight: LoadedRun, result: RunResult, said: RunFigures, inside: Mapping[str, np.ndarray] | None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Figures for scripts.
 
     Args:
@@ -157,7 +157,7 @@ def outcome(flight: LoadedRun, result: RunResult, record: Path | None) -> Outcom
     )
 
 
-def text(account: dict[str, Any], said: RunFigures, result: RunResult) -> str:
+def text(account: JsonObject, said: RunFigures, result: RunResult) -> str:
     """Text for a terminal: figures of merit, health of the lines, lateness of parts, events."""
     wire = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in account["counts"].items() if v)
     lines = [*said.lines, f"{'wire':<16}{wire}\n", result.latencies.table()]
@@ -187,7 +187,7 @@ def solution(name: str, series: MessageSeries, said: RunFigures, result: RunResu
     return xr.Dataset({**arrays, **said.arrays, **lateness(result)})
 
 
-def lateness(result: RunResult) -> dict[str, Any]:
+def lateness(result: RunResult) -> dict[str, xr.Variable]:
     """Histogram of the lateness of steps; empty in lock-step."""
     counted = result.latencies.summary()["histogram"]
     if not any(counted["counts"]):
@@ -196,7 +196,7 @@ def lateness(result: RunResult) -> dict[str, Any]:
     return steps | array("lateness_edge", np.array(counted["edges_us"], float))
 
 
-def notes(flight: LoadedRun, account: dict[str, Any]) -> list[str]:
+def notes(flight: LoadedRun, account: JsonObject) -> list[str]:
     """Sentences that sum up the figures."""
     out = []
     off = account["max_abs_difference_in_process"]

@@ -10,9 +10,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 from robins.bench.parts.config_files import private_folder, put
 from robins.bench.parts.idle import idleness
@@ -24,8 +25,9 @@ _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 _GRACE_S = 2.0  # between the signal to stop and the kill
 
 
-class ProcessExit(NamedTuple):
-    """A process that has ended."""
+@dataclass(eq=False)
+class ProcessExit(Exception):
+    """A process that has ended; raised where it has to be there."""
 
     part: str
     code: int  # negative: the signal that ended it

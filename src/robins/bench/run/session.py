@@ -6,24 +6,25 @@ import contextlib
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from robins import __version__
 from robins.bench.accounting import Latencies
-from robins.bench.broker.broker import Broker, Wiring
+from robins.bench.broker.broker import Broker
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Link
 from robins.bench.broker.restart import SentFrames
 from robins.bench.evaluation import RunResult
+from robins.bench.live.feed import JsonObject
 from robins.bench.parts.node import fewer_collections, realtime
 from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.recording.topics import completed
-from robins.bench.rig import LoadedRun, Rig, RunConfig
+from robins.bench.rig import LoadedRun, RunConfig
 from robins.bench.run.clocks import clock_of
 from robins.bench.run.orders import Orders, in_words
 from robins.bench.run.processes import PartProcesses, ProcessExit
@@ -55,17 +56,9 @@ class RunObserver(Protocol):
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
 
-    def commands(self, session: Session) -> list[dict[str, Any]]:
+    def commands(self, session: Session) -> list[JsonObject]:
         """Commands of the observer; see `robins.bench.live.LivePage.commands`."""
         ...
-
-
-class _RestartFailedError(Exception):
-    """A restarted part has died before it reached the state of the old one."""
-
-    def __init__(self, death: ProcessExit):
-        super().__init__(str(death))
-        self.death = death
 
 
 class Session:
@@ -249,7 +242,7 @@ class Session:
         if not self._stop:
             self._say(step)
 
-    def _do(self, command: Mapping[str, Any]) -> None:
+    def _do(self, command: JsonObject) -> None:
         what, label = command.get("do"), command.get("label")
         if what == "stop":
             self._stop = True
@@ -333,7 +326,8 @@ class Session:
             }
         return Broker(
             links,
-            wiring(self.rig, self.config),
+            self.rig,
+            {part: self.rig.part(part, self.config).takes for part in self.rig.parts},
             self.config.step_ns,
             self.injector,
             self._observe,
@@ -472,8 +466,8 @@ class Session:
             self.part_processes.start(part, self._speaks[part], since)
             try:
                 self.broker.revive(part, REVIVED_S, partial(self._require_alive, part))
-            except _RestartFailedError as again:
-                death, by_itself = again.death, True
+            except ProcessExit as again:
+                death, by_itself = again, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
             return self.event("restarted", f"'{part}' was restarted and told {told} again")
@@ -482,13 +476,7 @@ class Session:
         """Check that a restarted part has not died at once; deaths of others are handled later.
 
         Raises:
-            _RestartFailedError: it has died.
+            ProcessExit: it has died.
         """
         if died := self.part_processes.deaths(part):
-            raise _RestartFailedError(died[0])
-
-
-def wiring(rig: Rig, config: RunConfig) -> Wiring:
-    """Senders and receivers of the messages of a rig."""
-    takes = {part: dict(rig.part(part, config).takes) for part in rig.parts}
-    return Wiring(rig.wire, rig.sends, takes, rig.console)
+            raise died[0]

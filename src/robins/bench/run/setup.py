@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import pydantic
 
@@ -61,6 +61,10 @@ class Setup(Parameters):
     """
 
     rig: ClassVar[Rig]
+
+    if TYPE_CHECKING:  # parameters that a rig adds, see `setup_of`
+
+        def __getattr__(self, name: str) -> Any: ...
 
     bench: str
     title: str = ""

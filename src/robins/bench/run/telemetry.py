@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from robins.bench.broker.link import BenchError
 from robins.bench.evaluation import MessageSeries
 from robins.bench.rig import Rig
 from robins.bench.run.number_store import NumberStore
+from robins.bench.wire.fields import Field
 
 _OFTEN = 1 << 12  # messages between two releases of memory
 
@@ -35,7 +35,7 @@ class Telemetry:
         every = rig.noted
         self._fields = {m.name: [(f.name, f"{m.name}.{f.name}") for f in m.fields] for m in every}
 
-        def form(f: Any) -> tuple[tuple[int, ...], float | int]:
+        def form(f: Field) -> tuple[tuple[int, ...], float | int]:
             shape = (steps, f.length) if f.length > 1 else (steps,)
             return shape, np.nan if f.kind == "f64" else 0
 

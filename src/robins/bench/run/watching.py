@@ -5,15 +5,17 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from robins.bench.live import LivePage, Signal
 from robins.bench.live.feed import JsonObject
+from robins.bench.live.handle import Level
 from robins.bench.rig import LoadedRun, Rig
 from robins.bench.run.session import Session
 from robins.bench.run.setup import steps_of
 from robins.bench.run.spans import FaultSpans
 from robins.bench.status import STARTING, BenchStatus
+from robins.scenario import Parameters
 
 _EACH_S = 0.05  # least period of samples for the page
 _STATUS_S = 0.5
@@ -39,7 +41,7 @@ class Page(Protocol):
     def status(self, status: JsonObject) -> None:
         """Show the state of the bench."""
 
-    def event(self, level: Any, time_s: float, text: str) -> None:
+    def event(self, level: Level, time_s: float, text: str) -> None:
         """Show an event."""
 
     def commands(self) -> list[JsonObject]:
@@ -215,7 +217,7 @@ def _health(session: Session) -> dict[str, dict[str, int]]:
     return {link: {k: getattr(one.health, k) for k in names} for link, one in links}
 
 
-def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -> LivePage:
+def page_for(rig: Rig, given: Parameters, title: str, run: int, host: str, port: int) -> LivePage:
     """Start a live page for a run.
 
     Raises:

@@ -21,35 +21,26 @@ FIRST_DATA = 16
 BENCH = "bench"
 """Name of the hub; its number as a part is 0."""
 
+# fmt: off
 PROTOCOL: tuple[Message, ...] = (
-    message(
-        1,
-        "hello",
-        "A part is there; its first message.",
+    message(1, "hello", "A part is there; its first message.",
         Field("part", "u8", 1, "1", "number of the part"),
         Field("schema", "u32", 1, "1", "CRC-32C of this table, so that both mean the same"),
     ),
-    message(
-        2,
-        "tick",
-        "The clock lets a step begin. The time in the header is that of its end.",
+    message(2, "tick", "The clock lets a step begin. The time in the header is that of its end.",
         Field("step", "u32", 1, "1", "number of the step, from 0"),
     ),
-    message(
-        3,
-        "done",
-        "A part has sent all that it sends in a step.",
+    message(3, "done", "A part has sent all that it sends in a step.",
         Field("step", "u32", 1, "1", "number of the step"),
         Field("compute", "u32", 1, "ns", "time it took to compute"),
     ),
     message(4, "stop", "The run is over."),
-    message(
-        5,
-        "begin",
+    message(5, "begin",
         "The bench answers a hello. All that follow have the number of the run in this header.",
         Field("step", "u64", 1, "ns", "length of a step"),
     ),
 )
+# fmt: on
 NUMBERS = {m.name: m.number for m in PROTOCOL}
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from robins.bench.broker.faults import DeviceFault, nothing
+from robins.bench.broker.faults import DeviceFault, DeviceFaults, LinkFault, nothing
 from robins.bench.rig import Rig, later, named
 from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
@@ -22,43 +22,30 @@ __all__ = ["RIG", "WIRE"]
 
 _TURN, _SPEED, _FAR = 10.0, 1e5, 1e9  # rad, m/s, m: far beyond any airship
 
+# fmt: off
 WIRE = Wire(
     ("sins", "radar", "star", "air", "navigation"),
     (
-        message(
-            16,
-            "increment",
+        message(16, "increment",
             "What the inertial unit felt over the step, in body axes at its beginning.",
             f64("dt", 1, "s", "length", 1e4),
             f64("theta_b", 3, "rad", "turn", _TURN),
             f64("dv_b", 3, "m/s", "specific force, integrated once", _SPEED),
             f64("dr_b", 3, "m", "and twice", _FAR),
         ),
-        message(
-            17,
-            "fix",
-            "Radar and barometer; NaN: not seen.",
+        message(17, "fix", "Radar and barometer; NaN: not seen.",
             f64("place", 2, "m", "north and east from the datum", _FAR, True),
             f64("heading", 1, "rad", "clockwise from north", _TURN, True),
             f64("alt", 1, "m", "height above the ellipsoid", _FAR, True),
         ),
-        message(
-            18,
-            "attitude",
-            "What the star sensor sees; NaN: nothing.",
+        message(18, "attitude", "What the star sensor sees; NaN: nothing.",
             f64("euler", 3, "rad", "pitch, roll, heading", _TURN, True),
         ),
-        message(
-            19,
-            "wind",
-            "Forecast and air data, for filters that take them; NaN: missing.",
+        message(19, "wind", "Forecast and air data, for filters that take them; NaN: missing.",
             f64("wind_n", 2, "m/s", "thought to blow, towards north and east", _SPEED, True),
             f64("through_b", 3, "m/s", "velocity through the air, body axes", _SPEED, True),
         ),
-        message(
-            20,
-            "state",
-            "The airship at the end of the step.",
+        message(20, "state", "The airship at the end of the step.",
             f64("q_nb", 4, "1", "forward-right-down to north-east-down, scalar first", 2.0),
             f64("v_n", 3, "m/s", "north, east, down", _SPEED),
             f64("lat", 1, "rad", "latitude", 0.5 * math.pi),
@@ -69,9 +56,10 @@ WIRE = Wire(
         ),
     ),
 )
+# fmt: on
 
 
-def _shifted(values: Values, fault: Any, _: int) -> Values:
+def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
     """Radar fix that matches a wrong place."""
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
@@ -114,7 +102,7 @@ class AirshipRig(Rig):
         found = named("robins.systems.airship:SYSTEM").scenarios
         return {f"airship/{name}": path for name, path in sorted(found.items())}
 
-    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
+    def device_faults(self) -> DeviceFaults:
         """Faults of radar, star sensor and air data."""
         return _SAID, {"shift": (_SHIFT, default("200 m"))}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import manifold
-from robins.bench.evaluation import MessageSeries, RunFigures, RunResult, figures_of
+from robins.bench.evaluation import MessageSeries, RunFigures, RunResult, figures_of, rms
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rig import LoadedRun, Timing
 from robins.bench.run.setup import Setup, counted_from
@@ -119,21 +120,19 @@ def navigation(config: AirshipConfig) -> Part:
     """
     windy = WIND in config.y
     begin = Increments(*(np.asarray(x)[0] for x in config.u))
-    online: list[OnlineFilter] = []  # made at the first step; not needed to query the inputs
-    starts: list[Any] = []
+
+    @cache
+    def made() -> tuple[OnlineFilter, FilterState]:  # not needed to query the inputs
+        online = OnlineFilter(CANDIDATES[config.filter].make(), config.model, config.start)
+        return online, online.state
 
     def first() -> tuple[FilterState, Increments]:
-        if not online:
-            online.append(
-                OnlineFilter(CANDIDATES[config.filter].make(), config.model, config.start)
-            )
-            starts.append(online[0].state)
-        return starts[0], begin
+        return made()[1], begin
 
     def act(state: tuple[FilterState, Increments], k: int, inputs: Inputs):
         u, fix, seen, wind = (inputs[of] for of in ("increment", "fix", "attitude", "wind"))
-        held = u is None
-        online[0].state, increment = state
+        held, (online, _) = u is None, made()
+        online.state, increment = state
         if u is not None:
             increment = Increments(np.float64(u["dt"]), u["theta_b"], u["dv_b"], u["dr_b"])
         nothing = np.full(3, np.nan)
@@ -146,9 +145,9 @@ def navigation(config: AirshipConfig) -> Part:
         if windy:
             y[WIND] = nothing[:2] if wind is None else wind["wind_n"]
         aux = {WIND: np.zeros(3) if wind is None else wind["through_b"]} if windy else {}
-        x = np.asarray(online[0].step(y, increment, aux, keep=_kept))
+        x = np.asarray(online.step(y, increment, aux, keep=_kept))
         said = {**_state_fields(x), "held": int(held)}
-        return (online[0].state, increment), [("state", said)]
+        return (online.state, increment), [("state", said)]
 
     takes = {"increment": 0, "fix": 0, "attitude": 0, "wind": 0}
     return Part("navigation", takes, first, act, dict.fromkeys(takes))
@@ -193,15 +192,11 @@ def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     for block in BLOCKS:
         arrays |= block_array("error", block, error[None, :, block.where])
         arrays |= block_array("sigma", block, sigma[None, :, block.where])
-    lengths = (
-        ("attitude_rms_arcsec", slice(0, 3), _ARCSEC),
-        ("velocity_rms_m_s", slice(3, 6), 1.0),
-        ("horizontal_rms_m", slice(6, 8), 1.0),
-    )
-    metrics: dict[str, float | None] = {}
-    for name, where, unit in lengths:
-        squares = np.sum(error[counted, where] ** 2, axis=1)
-        known = squares[np.isfinite(squares)]
-        metrics[name] = float(np.sqrt(np.mean(known))) / unit if len(known) else None
+    attitude = rms(error[counted, :3])
+    metrics = {
+        "attitude_rms_arcsec": None if attitude is None else attitude / _ARCSEC,
+        "velocity_rms_m_s": rms(error[counted, 3:6]),
+        "horizontal_rms_m": rms(error[counted, 6:8]),
+    }
     counts = {"steps_without_increment": int(np.sum(series["state.held"]))}
     return RunFigures(metrics, counts, arrays=arrays, lines=figures_of(metrics))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from robins.bench.broker.faults import DeviceFault
+from robins.bench.broker.faults import DeviceFault, DeviceFaults, LinkFault, ParameterTable
 from robins.bench.rig import Rig, later, named
 from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
@@ -41,21 +41,16 @@ _NAVIGATED = (
     size("wrong", len(SUSPECTS), "1", f"probability that it is: {', '.join(SUSPECTS)}", 1.001),
 )
 
+# fmt: off
 WIRE = Wire(
     ("imu", "gnss", "navigation"),
     (
-        message(
-            16,
-            "sample",
-            "A sample of the inertial unit, along its own axes; NaN: missing.",
+        message(16, "sample", "A sample of the inertial unit, along its own axes; NaN: missing.",
             _TIME,
             f64("omega_s", 3, "rad/s", "turn rate", 1e4, True),
             f64("f_s", 3, "m/s^2", "specific force", 1e6, True),
         ),
-        message(
-            17,
-            "fix",
-            "What the receiver found of its antenna; NaN: not found.",
+        message(17, "fix", "What the receiver found of its antenna; NaN: not found.",
             _TIME,
             *_PLACE,
             size("sigma", 3, "m", "stated, north, east, down", _FAR),
@@ -63,21 +58,19 @@ WIRE = Wire(
             size("sigma_v", 3, "m/s", "stated, north, east, down", _FAR),
             Field("quality", "u8", 1, "1", "of RTKLIB: 1 fix, 2 float, 5 single; 0: not told"),
         ),
-        message(
-            18,
-            "state",
-            "The unit at the stamp of the newest sample.",
+        message(18, "state", "The unit at the stamp of the newest sample.",
             *_NAVIGATED,
             Field("flags", "u8", 1, "1", ", ".join(f"bit {k}: {t}" for k, t in enumerate(FLAGS))),
         ),
-        message(
-            19, "epoch", "What the filter says at the end of a block, with all fixes.", *_NAVIGATED
+        message(19, "epoch", "What the filter says at the end of a block, with all fixes.",
+            *_NAVIGATED,
         ),
     ),
 )
+# fmt: on
 
 
-def _shifted(values: Values, fault: Any, _: int) -> Values:
+def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
     """Fix shifted to the north."""
     return {**values, "lat": values["lat"] + fault.shift / 6.378137e6}
 
@@ -124,11 +117,11 @@ class InsGnssRig(Rig):
         of = "robins.systems.ins_gnss.log"
         return [name for name in named(f"{of}:NAMES") if name not in named(f"{of}:SMOOTHED")]
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> ParameterTable:
         """Machine that steps the filter; left out: as `LiveInsGnss` chooses."""
         return {"machine": (Literal["jax", "vm", "c"] | None, None)}
 
-    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
+    def device_faults(self) -> DeviceFaults:
         """Faults of the receiver."""
         return _SAID, {"shift": (_SHIFT, default("30 m"))}
 

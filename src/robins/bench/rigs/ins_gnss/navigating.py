@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from robins.bench.evaluation import (
     RunResult,
     figures_of,
     latest,
+    rms,
 )
 from robins.bench.live.feed import Signal
 from robins.bench.parts.station import Inputs, Part
@@ -26,6 +27,7 @@ from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
 from robins.bench.rig import ExportSources, LoadedRun, RigError, Timing
 from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
+from robins.bench.run.setup import Setup
 from robins.bench.wire.fields import Values
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.earth import Geodetic
@@ -124,17 +126,15 @@ def timing(given: NavigationParameters) -> Timing:
     return Timing(1.0 / rate_hz, round(lasts_s * rate_hz), 0)
 
 
-def prepare(setup: Any, given: NavigationParameters) -> InsGnssConfig:
+def prepare(setup: Setup, given: NavigationParameters) -> InsGnssConfig:
     """The config of a run.
 
     Raises:
         RigError: nothing sends as imu or gnss.
         robins.logs.LogError: a file of the log cannot be read.
     """
-    believed, dataset = (
-        InsGnssReplay(**{k: getattr(given, k) for k in InsGnssReplay.model_fields}),
-        None,
-    )
+    believed = InsGnssReplay(**{k: getattr(given, k) for k in InsGnssReplay.model_fields})
+    dataset = None
     if given.log:
         dataset = _logged(given.log)
         believed = with_lever_arm(believed, dataset.lever_arm_b_m)
@@ -198,15 +198,14 @@ step."""
 
 def navigation(config: InsGnssConfig) -> Part:
     """The navigation computer: sends what `LiveInsGnss` reports."""
-    made: list[LiveInsGnss] = []
+
+    @cache
+    def made() -> LiveInsGnss:  # compiles; not needed to query the inputs
+        return LiveInsGnss(config.given, *config.rates_hz, config.filter, machine=config.machine)
 
     def begin() -> InsGnssNavigationState:
-        if not made:  # compiles; not needed to query the inputs
-            made.append(
-                LiveInsGnss(config.given, *config.rates_hz, config.filter, machine=config.machine)
-            )
-        made[0].start_over()
-        return made[0], ()
+        made().start_over()
+        return made(), ()
 
     def act(state: InsGnssNavigationState, k: int, inputs: Inputs):
         live, waiting = state
@@ -235,8 +234,8 @@ def navigation(config: InsGnssConfig) -> Part:
 def _answer_fields(n: Navigation) -> Values:
     place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
     wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
-    state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
-    return {**state, "sigma": n.sigma, "wrong": wrong}
+    state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, "sigma": n.sigma}
+    return {**state, **place, "wrong": wrong}
 
 
 def aboard(flight: LoadedRun) -> ExportSources:
@@ -291,17 +290,11 @@ def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
         error = against_truth(config.dataset.truth, series)
         for block in blocks:
             arrays |= block_array("error", block, error[None, :, block.where])
-        for name, e in (
-            ("heading_rms_deg", np.degrees(error[:, 2])),
-            ("velocity_rms_m_s", np.linalg.norm(error[:, 3:6], axis=1)),
-            ("horizontal_rms_m", np.linalg.norm(error[:, 6:8], axis=1)),
-        ):
-            known = e[np.isfinite(e)]
-            metrics[name] = float(np.sqrt(np.mean(known**2))) if len(known) else None
-    counts = {
-        f"steps_{name}": int(np.sum(series["state.flags"] >> k & 1))
-        for k, name in enumerate(FLAGS[:2])
-    }
+        metrics["heading_rms_deg"] = rms(np.degrees(error[:, 2]))
+        metrics["velocity_rms_m_s"] = rms(np.linalg.norm(error[:, 3:6], axis=1))
+        metrics["horizontal_rms_m"] = rms(np.linalg.norm(error[:, 6:8], axis=1))
+    flags = series["state.flags"]
+    counts = {f"steps_{of}": int(np.sum(flags >> k & 1)) for k, of in enumerate(FLAGS[:2])}
     each = zip(SUSPECTS, series["state.wrong"].T, strict=True)
     wrong = {name: x for name, x in each if np.any(np.isfinite(x))}
     arrays |= tables("wrong", [wrong])
@@ -358,11 +351,8 @@ _OFFERED = (
 def view() -> PageView:
     """Page with attitude, velocity, and position relative to the start."""
     plots = (("velocity", "m/s"), ("position from the start", "m"), ("sigma of the position", "m"))
-    three = [
-        Signal(f"{plot} {axis}", unit, plot)
-        for plot, unit in plots
-        for axis in ("north", "east", "down")
-    ]
+    axes = ("north", "east", "down")
+    three = [Signal(f"{plot} {axis}", unit, plot) for plot, unit in plots for axis in axes]
     drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
     drawn += [Signal(words(name), "1", "probability of being wrong") for name in SUSPECTS]
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import DeviceFault, nothing
+from robins.bench.broker.faults import DeviceFault, DeviceFaults, LinkFault, nothing
 from robins.bench.rig import later, named
 from robins.bench.rigs.satellite import SatelliteRig, messages
 from robins.bench.wire.fields import Values, f64, message
@@ -32,26 +32,22 @@ __all__ = ["RIG", "STARS", "TAKES", "WIRE"]
 STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field of view
 _SPLIT = {"plant": ("dynamics", "kinematics"), "star": ("sky", "star")}
 
+# fmt: off
 WIRE = Wire(
     tuple(part for old in messages.PARTS for part in _SPLIT.get(old, (old,))),
     (
         *messages.WIRE.data,
-        message(
-            32,
-            "turn",
-            "How the craft turns in the step, from the dynamics to the kinematics.",
+        message(32, "turn", "How the craft turns in the step, from the dynamics to the kinematics.",
             f64("gibbs_b", 3, "1", "tangent of half the turn, along its axis, body axes", 1e3),
             f64("omega_b", 3, "rad/s", "rate against inertial at the end of the step", 1e3),
         ),
-        message(
-            33,
-            "stars",
-            "What the star simulator shows the star sensor, brightest first.",
+        message(33, "stars", "What the star simulator shows the star sensor, brightest first.",
             f64("vectors_s", 3 * STARS, "1", "unit vectors, sensor axes; NaN: no star", 2.0, True),
             f64("magnitude", STARS, "1", "of each; NaN: no star", 50.0, True),
         ),
     ),
 )
+# fmt: on
 
 SENDS = {part: sent for part, sent in messages.SENDS.items() if part != "plant"} | {
     "dynamics": ("turn",),
@@ -66,7 +62,7 @@ TAKES = {part: taken for part, taken in messages.TAKES.items() if part != "plant
 }
 
 
-def _hidden(said: Values, fault: Any, _: int) -> Values:
+def _hidden(said: Values, fault: LinkFault, _: int) -> Values:
     """Star field without its brightest stars."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
     said["magnitude"][: fault.stars] = np.nan
@@ -103,7 +99,7 @@ class LaboratoryRig(SatelliteRig):
         """Scenario of the satellite with a camera."""
         return {"laboratory/stars": named("robins.systems.satellite:SYSTEM").scenarios["stars"]}
 
-    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
+    def device_faults(self) -> DeviceFaults:
         """Faults of the satellite and of the star simulator."""
         kinds, parameters = super().device_faults()
         return {**kinds, **_SAID}, {**parameters, "stars": (_STARS, 1)}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -45,10 +45,13 @@ from robins.systems.satellite.nodes import (
 )
 from robins.systems.satellite.parameters import AttitudeLoop
 
+if TYPE_CHECKING:
+    from robins.bench.run.setup import Setup
+
 MARGIN_RAD = 2e-3  # beyond the field of view, for a slightly misaligned camera
 
 
-def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
+def prepare(setup: Setup, given: AttitudeLoop) -> SatelliteConfig:
     """The config of a run, which is that of the satellite.
 
     Raises:

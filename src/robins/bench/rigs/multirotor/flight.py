@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pydantic
 
 from robins.bench.evaluation import RunFigures, RunResult, arrays_of, figures_of
 from robins.bench.rig import LoadedRun
-from robins.bench.run.setup import counted_from
+from robins.bench.run.setup import Setup, counted_from
 from robins.earth import curvature_radii
 from robins.earth.magnetic import field_n, wmm_for
 from robins.results import array
@@ -74,7 +74,7 @@ class MultirotorConfig(NamedTuple):
         return (place - start) * np.array([*self.m_per_rad, -1.0])
 
 
-def prepare(setup: Any, given: Multirotor) -> MultirotorConfig:
+def prepare(setup: Setup, given: Multirotor) -> MultirotorConfig:
     """The config of a run; the Earth is flat over the tens of metres of a flight."""
     field_T = np.asarray(field_n(wmm_for(given.year), given.lat, given.lon, given.alt, given.year))
     north_m, east_m = (float(x) + given.alt for x in curvature_radii(given.lat))

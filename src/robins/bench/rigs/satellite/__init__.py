@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import DeviceFault
+from robins.bench.broker.faults import DeviceFault, DeviceFaults, LinkFault, ParameterTable
 from robins.bench.rig import Rig, later, named
 from robins.bench.rigs.satellite.messages import CONSOLE, SENDS, TAKES, WHEELS, WIRE
 from robins.bench.wire.fields import Values
@@ -47,7 +47,7 @@ class RateTableParameters(Parameters):
 _SECOND_NS = 1_000_000_000
 
 
-def _turned(said: Values, fault: Any, _: int) -> Values:
+def _turned(said: Values, fault: LinkFault, _: int) -> Values:
     """Attitude turned about body z."""
     from robins.rotation import multiply
 
@@ -56,7 +56,7 @@ def _turned(said: Values, fault: Any, _: int) -> Values:
     return {**said, "q_ib": np.asarray(multiply(said["q_ib"], about_z))}
 
 
-def _sign(said: Values, _: Any, now_ns: int) -> Values:
+def _sign(said: Values, _: LinkFault, now_ns: int) -> Values:
     """Quaternion of opposite sign in every other second."""
     odd = (now_ns + 1) // _SECOND_NS % 2 == 1
     return {**said, "q_ib": -said["q_ib"]} if odd else said
@@ -66,7 +66,7 @@ def _lost(*_: Any) -> Values:
     return {"q_ib": np.full(4, np.nan), "factor": np.zeros(9), "stars": 0}
 
 
-def _without_wheel(said: Values, fault: Any, _: int) -> Values:
+def _without_wheel(said: Values, fault: LinkFault, _: int) -> Values:
     said["wheel_torque"][fault.wheel] = 0.0
     return said
 
@@ -140,14 +140,14 @@ class SatelliteRig(Rig):
         names = named("robins.systems.satellite.study:FILTERS")
         return ["mekf", *(name for name in names if name != "mekf")]
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> ParameterTable:
         """Rate table with a lag, and the machine by which parts compute."""
         return {
             "table": (RateTableParameters | None, None),
             "machine": (Literal["jax", "vm", "c"], "jax"),
         }
 
-    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
+    def device_faults(self) -> DeviceFaults:
         """Faults of star sensor and wheels."""
         return SAID, PARAMETERS
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,9 @@ from robins.systems.satellite.nodes import (
     compiled_alone,
 )
 from robins.systems.satellite.parameters import AttitudeLoop
+
+if TYPE_CHECKING:
+    from robins.bench.run.setup import Setup
 
 _BLOCK = 1024  # rows of a run that a part converts to vectors at a time
 
@@ -71,7 +74,7 @@ class SatelliteConfig(NamedTuple):
         return int(np.argmin(self.due)), int(np.argmax(self.due))
 
 
-def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
+def prepare(setup: Setup, given: AttitudeLoop) -> SatelliteConfig:
     """The config of a run of the bench.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 
 from robins.bench.evaluation import (
@@ -19,6 +20,7 @@ from robins.bench.evaluation import (
     RunFigures,
     RunResult,
     latest,
+    rms,
 )
 from robins.bench.live.feed import Signal
 from robins.bench.recording.topics import JSON, Topic, as_json, imu
@@ -76,9 +78,8 @@ def flag(series: Arrays, text: str) -> np.ndarray:
 
 def rms_arcsec(error: np.ndarray, counted: slice) -> float:
     """RMS over the counted steps of the root sum square of three axes [arcsec]."""
-    some = error[counted]
-    some = some[np.all(np.isfinite(some), -1)]
-    return float(np.sqrt(np.mean(np.sum(some**2, -1)))) / ARCSEC if len(some) else float("nan")
+    found = rms(error[counted])
+    return float("nan") if found is None else found / ARCSEC
 
 
 def peak_arcsec(error: np.ndarray, counted: slice) -> float:
@@ -146,7 +147,7 @@ def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
     return [f"{what} in {steps} {rest}" for what, steps in unusable if steps]
 
 
-def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, Any]:
+def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, xr.Variable]:
     """Time series of the run, as `robins.results` names them."""
     f = result.series
     sigma, bias, innovation = (
@@ -159,7 +160,7 @@ def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dic
     wheels = f["wheels.momentum"][:, : len(result.config.vehicle.craft.wheel_h)]
     body: dict[str, Any] = {"unit": "rad", "frame": "body", "axes": _AXES, "display_unit": "arcsec"}
     rate = body | {"unit": "rad/s", "display_unit": "arcsec/s"}
-    out: dict[str, Any] = {}
+    out: dict[str, xr.Variable] = {}
 
     def add(role: str, values: np.ndarray, of: str, **about: Any) -> None:
         out.update(array(role, values[None], of, **about))

@@ -30,30 +30,19 @@ _ACTUATORS = (
     f64("dipole_b", 3, "A m^2", "of the magnetorquers", _ACTS),
 )
 
+# fmt: off
 MESSAGES: tuple[Message, ...] = (
-    message(
-        16,
-        "motion",
-        "The craft as it truly is, from the plant to the rate table.",
+    message(16, "motion", "The craft as it truly is, from the plant to the rate table.",
         f64("q_ib", 4, "1", _QUATERNION, _UNIT),
         f64("omega_b", 3, "rad/s", "rate against inertial", _RATE),
     ),
-    message(
-        17,
-        "mounted",
-        "Attitude of the rate table, which its sensors have.",
+    message(17, "mounted", "Attitude of the rate table, which its sensors have.",
         f64("q_ib", 4, "1", _QUATERNION, _UNIT),
     ),
-    message(
-        18,
-        "gyro",
-        "A sample of the gyros.",
+    message(18, "gyro", "A sample of the gyros.",
         f64("theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis", _TURN, True),
     ),
-    message(
-        19,
-        "star",
-        "A frame of the star sensor.",
+    message(19, "star", "A frame of the star sensor.",
         f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved", _UNIT, True),
         f64(
             "factor",
@@ -65,10 +54,7 @@ MESSAGES: tuple[Message, ...] = (
         ),
         Field("stars", "u16", 1, "1", "used; 0: not told"),
     ),
-    message(
-        20,
-        "estimate",
-        "Attitude as determined.",
+    message(20, "estimate", "Attitude as determined.",
         f64("q_ib", 4, "1", _QUATERNION, _UNIT),
         f64("gyro_bias", 3, "rad/s", "reported less true rate", _RATE),
         size("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes", _SIGMA),
@@ -76,15 +62,10 @@ MESSAGES: tuple[Message, ...] = (
     ),
     message(21, "command", "What control asks of the actuators.", *_ACTUATORS),
     message(22, "actuation", "What the actuators give.", *_ACTUATORS),
-    message(
-        23,
-        "wheels",
-        "Momenta of the wheels, from their speeds.",
+    message(23, "wheels", "Momenta of the wheels, from their speeds.",
         f64("momentum", WHEELS, "N m s", "along each wheel's axis", _ACTS),
     ),
-    message(
-        24,
-        "innovation",
+    message(24, "innovation",
         "What the filter made of a frame of the star sensor, for who watches.",
         f64("innovation", 3, "rad", "measured less expected, body axes", _TURN, True),
         size("sigma", 3, "rad", "stated", _SIGMA),
@@ -93,10 +74,7 @@ MESSAGES: tuple[Message, ...] = (
 )
 
 _CONSOLE: tuple[Message, ...] = (
-    message(
-        25,
-        "reference",
-        "Where the craft is to point from now on, from the operator.",
+    message(25, "reference", "Where the craft is to point from now on, from the operator.",
         f64(
             "q_ib",
             4,
@@ -107,14 +85,12 @@ _CONSOLE: tuple[Message, ...] = (
         ),
         Field("rate", "f64", 1, "rad/s", "greatest of the slew; 0: as the craft can", (0.0, _RATE)),
     ),
-    message(
-        26,
-        "mode",
-        "What the computers on board are to do from now on, from the operator.",
+    message(26, "mode", "What the computers on board are to do from now on, from the operator.",
         Field("mode", "u8", 1, "1", "0: run; 1: stand by: control rests; 2: as it is", (0, 2)),
         Field("reset", "u8", 1, "1", "1: the filter begins anew with the next star frame", (0, 1)),
     ),
 )
+# fmt: on
 
 WIRE = Wire(PARTS, (*MESSAGES, *_CONSOLE))
 CONSOLE = tuple(m.name for m in _CONSOLE)

@@ -8,7 +8,7 @@ of the commands, with the same bits in control, in the run inside one program, a
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -32,14 +32,6 @@ _BRAKES = 4.0  # peak acceleration times duration over initial rate, for a decay
 Said = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
 
 
-class AttitudeTarget(NamedTuple):
-    """Target attitude at the boundary of two steps; in the order of a row of the course."""
-
-    q_ib: Any  # (4,)
-    omega_b: Any  # (3,) rad/s
-    alpha_b: Any  # (3,) rad/s^2
-
-
 class SlewPlan(NamedTuple):
     """Last command of the operator, and the slew to it."""
 
@@ -53,15 +45,15 @@ class SlewPlan(NamedTuple):
 _STILL = np.zeros(3)
 
 
-def attitude_target(config: SatelliteConfig, plan: SlewPlan | None, edge: int) -> AttitudeTarget:
+def attitude_target(config: SatelliteConfig, plan: SlewPlan | None, edge: int) -> Reference:
     """Target attitude at an edge, 0 to E, by the last plan before it."""
     if plan is None or np.isnan(plan.q_ib[0]):
         course, last = config.rows.course, len(config.due) - 1
         k = min(edge, last)
         q = course.ref_q_ib[k] if edge <= last else course.ref_end_q_ib[last]
-        base = AttitudeTarget(q, course.ref_omega_b[k], course.ref_alpha_b[k])
+        base = Reference(q, course.ref_omega_b[k], course.ref_alpha_b[k])
     else:
-        base = AttitudeTarget(plan.q_ib, _STILL, _STILL)
+        base = Reference(plan.q_ib, _STILL, _STILL)
     if plan is None:
         return base
     since_s = (edge - plan.edge) * config.step_ns * 1e-9
@@ -70,7 +62,7 @@ def attitude_target(config: SatelliteConfig, plan: SlewPlan | None, edge: int) -
     # one epoch at a time, so that all callers get the same bits
     one = Reference(*(x[None] for x in base))
     way = handover_reference(one, plan.turn, plan.rate, plan.length_s, np.array([since_s]))
-    return AttitudeTarget(*(np.asarray(x)[0] for x in way))
+    return Reference(*(np.asarray(x)[0] for x in way))
 
 
 def plan_after_command(
@@ -105,7 +97,7 @@ def plan_after_command(
 
 
 @jax.jit
-def _between(there: AttitudeTarget, now: AttitudeTarget):
+def _between(there: Reference, now: Reference):
     """Rotation vector [rad] and rate [rad/s] of the second relative to the first, in its axes."""
     turn = multiply(conjugate(there.q_ib), now.q_ib)
     return to_rotvec(turn), now.omega_b - rotate(conjugate(turn), there.omega_b)
@@ -128,7 +120,7 @@ def limits(config: SatelliteConfig) -> tuple[float, float]:
     return SHARE * h / inertia, SHARE * tau / inertia
 
 
-def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[AttitudeTarget]:
+def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Reference]:
     """Target attitudes at each edge of the E steps, E + 1 of them.
 
     Args:
@@ -136,7 +128,7 @@ def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Atti
         said: commands of the operator, in order; of two in one step the later applies.
     """
     heard = {step: (q_ib, rate) for step, q_ib, rate in said}
-    out: list[AttitudeTarget] = []
+    out: list[Reference] = []
     plan = None
     for edge in range(len(config.due) + 1):
         if edge in heard:
@@ -156,7 +148,7 @@ def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[Said]:
 
 def target_after(
     config: SatelliteConfig, series: Mapping[str, np.ndarray], steps: int
-) -> AttitudeTarget:
+) -> Reference:
     """Target attitude after a number of steps."""
     plan = None
     for step, q_ib, rate in commands_until(series, steps):
