@@ -148,17 +148,19 @@ def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str,
         different = np.unique(np.round(seen, 6), return_index=True)[1]
         starts = [starts[k] for k in different[-_PROMISING[block] :]]
     fits = [fitted(known, _ROUNDS, best.state), *(fitted(start, _ROUNDS) for start in starts)]
-    # an extra offset for a part of the log must pay off
-    gains = [_gain(views, best, one) - _PART * len(one.state.offset) for one in fits]
-    return fits[int(np.argmax(gains))]
+    return fits[int(np.argmax([_gain(views, best, one) for one in fits]))]
 
 
 def _gain(views: MotionIntegrals, before: MotionFit, after: MotionFit) -> float:
-    """A third of the gain of log-likelihood, with a variance for each stretch."""
+    """A third of the gain of log-likelihood, with a variance for each stretch.
+
+    An extra offset for a part of the log must pay off.
+    """
     least = _LEAST_SHARE * float(np.median(power_of(views)))
     one, other = (np.log(f.by_stretch(views) + least) for f in (before, after))
     strain = (before.strain - after.strain) / 3.0
-    return 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
+    gain = 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
+    return gain - _PART * (len(after.state.offset) - len(before.state.offset))
 
 
 def _starts(
