@@ -7,7 +7,7 @@ import pytest
 from made_logs import rows_of, velocity_ned, with_gnss, with_imu
 from scipy.spatial.transform import Rotation
 
-from robins.logs import motion, motion_fit
+from robins.logs import motion, motion_fit, motion_models
 from robins.logs.checks_motion import estimates
 from robins.logs.gnss_motion import lowest, steps_of, track_of, velocity_delay
 from robins.logs.motion_fit import start_of, trimmed
@@ -115,6 +115,19 @@ def test_estimates_lie_within_three_sigmas(drive, changes, name, value):
     found, sigma = estimates(verdict)[name]
     assert abs(found - value) < 3.0 * sigma
     assert sigma < 0.1 * max(abs(value), 0.5)
+
+
+def test_a_clock_is_cut_where_it_was_set():
+    zero, lags = np.zeros(3), np.arange(-5.0, 5.05, 0.1)
+    start = motion_fit.PairState(
+        np.eye(3), zero, np.eye(3), zero, zero, 0.0, np.zeros(1), np.zeros(15, int)
+    )
+    late = np.repeat([0.0, -1.0, 2.0], [5, 4, 6])
+    cost = 30.0 * np.minimum((lags - late[:, None]) ** 2, 1.0)
+    state = motion_models._steps(start, lags, cost)
+    np.testing.assert_allclose(state.offset[state.part], late, atol=1e-9)
+    once = motion_models._steps(start, lags, cost - cost + cost[:1])
+    np.testing.assert_allclose(once.offset, [0.0], atol=1e-9)
 
 
 def about_z(degrees):
