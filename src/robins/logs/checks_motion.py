@@ -141,7 +141,8 @@ def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
         factor = verdict.factor * abs(state.M_a[k, k])
         out[f"accel {axis}"] = factor, factor * of_force[k]
         # a clock offset and an antenna ahead are not separable at constant speed
-        out[f"lever {axis}"] = levers.state.lever[k], levers.sigma[LEVER][k]
+        arm = levers.state.lever[k]
+        out[f"lever {axis}"] = arm, float(np.hypot(levers.sigma[LEVER][k], _LEAST_SCALE * arm))
     out["rate"] = state.rate, sigma[RATE]
     offset, of_offset = state.offset, np.maximum(sigma[OFFSET:], _LEAST_S)
     out["offset"] = offset[0], of_offset[0]
@@ -182,7 +183,7 @@ def travel(verdict: ModelChoice) -> tuple[float, float] | None:
         return None
     parts = np.array_split(np.angle(ahead / mean), min(len(verdict.views.start_s), 8))
     each = np.array([np.mean(part) for part in parts])
-    spread = float(np.std(each)) / np.sqrt(max(len(each) - 1, 1))
+    spread = float(np.std(each))  # of crab and slip, which last: more parts do not average them
     return float(np.rad2deg(np.angle(mean))), float(np.rad2deg(max(spread, 0.005)))
 
 

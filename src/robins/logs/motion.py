@@ -406,9 +406,11 @@ def between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
 def rotations(phi: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], by Rodrigues' formula."""
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
-    K = skew(phi)
-    half_sinc = np.sinc(0.5 * angle / np.pi)
-    return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half_sinc**2 * K @ K
+    out = phi[..., :, None] * phi[..., None, :]
+    out *= 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    out += np.sinc(angle / np.pi) * skew(phi)
+    out += np.cos(angle) * np.eye(3)
+    return out
 
 
 def kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

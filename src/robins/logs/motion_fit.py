@@ -17,6 +17,8 @@ Velocities are in axes that are inertial during a stretch, so Earth rate needs n
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +39,7 @@ LEVER, RATE, OFFSET = slice(21, 24), 24, 25  # an offset for each part of the lo
 _UPPER = np.triu_indices(3)
 _PAD_S, _SMOOTH_S, _EDGE_S = 0.5, 0.1, 0.1
 _MOST, _MOST_BIAS, _MOST_LEVER_M = 0.3, 1.0, 5.0  # largest steps of Gauss-Newton
+_SHORTER = 0.3  # share of a step that did not help, which is tried next
 _STILL = 0.03  # step, in sigmas, that ends the iteration
 _TRIMMED = 0.95  # share of the residuals, the smallest, that rates a fit
 _ROBUST = 3.0  # typical residuals; larger ones have less weight
@@ -100,6 +103,15 @@ def start_of(
     return PairState(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
 
 
+def corrected(views: MotionIntegrals, state: PairState) -> MotionIntegrals:
+    """Integrals of the IMU with the matrices and biases of a state applied."""
+    time_s = np.arange(len(views.turn))[:, None] / RATE_HZ
+    return views._replace(
+        turn=views.turn @ state.M_g.T - time_s * state.b_g,
+        push=views.push @ state.M_a.T - time_s * state.b_a,
+    )
+
+
 def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gained velocity and its derivatives.
 
@@ -120,30 +132,23 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
         (t + state.shift(views.node_of, t, views.middle_s) - first[views.node_of]) * RATE_HZ
         for t in (views.begin_s, views.end_s)
     )
+    at = partial(_sampled, views.node_of)
+    angle, C_end = _cumulative(dphi), at(end, C)
 
-    def at(index: np.ndarray, values: np.ndarray) -> np.ndarray:
-        index = np.clip(index, 0, n_fine) + views.node_of * (n_fine + 1)
-        low = np.minimum(index.astype(np.int64), values.shape[0] * values.shape[1] - 2)
-        flat, share = values.reshape(-1, *values.shape[2:]), index - low
-        share = share.reshape(-1, *([1] * (flat.ndim - 1)))
-        return (1.0 - share) * flat[low] + share * flat[low + 1]
+    def speed(index: np.ndarray) -> np.ndarray:
+        """Velocity (nodes, 3, 1) of the antenna."""
+        return at(index, S[..., :1]) + (_swing(at, index, C, angle) @ state.lever)[..., None]
 
-    C_end = at(end, C)
     if views.means:
         over = ((end - begin) / RATE_HZ)[:, None, None]
         D = _cumulative((S[:, 1:] + S[:, :-1]) * (0.5 / RATE_HZ))
         u = (at(end, D) - at(begin, D)) / over
-        force = (at(end, S[..., :1]) - at(begin, S[..., :1])) / over
+        force = (speed(end) - speed(begin)) / over
         swing = (C_end - at(begin, C)) / over
     else:
-        u = at(end, S)
-        near = [at(end + k * _SMOOTH_S * RATE_HZ, S[..., :1]) for k in (-1, 1)]
-        force = (near[1] - near[0]) / (2 * _SMOOTH_S)
-        angle = _cumulative(dphi)
-        # by two differences (Richardson), since a mean over 0.2 s would smooth the motion of a step
-        ends = [at(end + k, angle) for k in (-2, -1, 1, 2)]
-        omega = (8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) * (RATE_HZ / 12.0)
-        swing = C_end @ skew(omega)
+        u, apart = at(end, S), _SMOOTH_S * RATE_HZ
+        force = (speed(end + apart) - speed(end - apart)) / (2 * _SMOOTH_S)
+        swing = _swing(at, end, C, angle)
     u[..., 0] += swing @ state.lever
     middle = 0.5 * (views.begin_s + views.end_s) - views.middle_s
     in_part = state.part[views.node_of][:, None] == np.arange(len(state.offset))
@@ -154,6 +159,29 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
     np.maximum.at(last, views.node_of, end)
     seen = _recorded(views, first + _PAD_S, first + last / RATE_HZ)[views.of]
     return u[views.node + views.stride] - u[views.node], C_end, seen
+
+
+def _sampled(stretch: np.ndarray, index: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Linear interpolation (nodes, ...) of values (stretches, fine + 1, ...) at real indices."""
+    fine = values.shape[1]
+    index = np.clip(index, 0, fine - 1) + stretch * fine
+    low = np.minimum(index.astype(np.int64), len(values) * fine - 2)
+    flat = values.reshape(-1, *values.shape[2:])
+    share = (index - low).reshape(-1, *([1] * (flat.ndim - 1)))
+    return (1.0 - share) * flat[low] + share * flat[low + 1]
+
+
+def _swing(
+    at: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    index: np.ndarray,
+    C: np.ndarray,
+    angle: np.ndarray,
+) -> np.ndarray:
+    """Matrices (nodes, 3, 3) C [omega x] from a lever arm to the velocity of its end."""
+    # by two differences (Richardson), since a mean over 0.2 s would smooth the motion of a step
+    ends = [at(index + k, angle) for k in (-2, -1, 1, 2)]
+    omega = (8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) * (RATE_HZ / 12.0)
+    return at(index, C) @ skew(omega)
 
 
 def _grown(
@@ -185,7 +213,9 @@ def _grown(
 
 def _cumulative(steps: np.ndarray) -> np.ndarray:
     """Sums up to each of the fine times, along the second axis."""
-    return np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)], axis=1)
+    out = np.zeros((len(steps), steps.shape[1] + 1, *steps.shape[2:]))
+    np.cumsum(steps, axis=1, out=out[:, 1:])
+    return out
 
 
 def _recorded(views: MotionIntegrals, first: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -195,32 +225,45 @@ def _recorded(views: MotionIntegrals, first: np.ndarray, last: np.ndarray) -> np
     return inside & ~np.any((begin < last[:, None]) & (end > first[:, None]), axis=1)
 
 
-def fit(views: MotionIntegrals, start: PairState, prior: np.ndarray, rounds: int = 8) -> MotionFit:
-    """Fit all parameters by Gauss-Newton.
+def fit(
+    views: MotionIntegrals,
+    start: PairState,
+    prior: np.ndarray,
+    rounds: int = 8,
+    begin: PairState | None = None,
+) -> MotionFit:
+    """Fit all parameters by Gauss-Newton, with shorter steps where a step does not help.
 
     Args:
         views: the integrals.
-        start: initial state, which is also the prior mean.
+        start: the prior mean.
         prior: (parameters, parameters) prior covariance.
         rounds: largest number of steps.
+        begin: initial state, by default the prior mean.
     """
-    state, cost = start, np.inf
-    result, step = _step(views, state, start, prior)
-    best = result
+    best, step = _step(views, begin or start, start, prior)
+    cost, share = _cost(best), 1.0
+    most = np.full(len(step), _MOST)
+    most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
     for _ in range(rounds):
-        seen = result.squares[np.isfinite(result.squares)]
-        if not len(seen):
+        if not share * np.max(np.abs(step / best.sigma)) > _STILL:
             break
-        now = 3 * len(seen) * np.log(trimmed(seen) + 1e-12) + result.strain
+        state = _moved(best.state, share * np.clip(step, -most, most))
+        result, onward = _step(views, state, start, prior)
+        now = _cost(result)
         if now < cost:
-            best, cost = result, now
-        if np.max(np.abs(step / result.sigma)) < _STILL:
-            break
-        most = np.full(len(step), _MOST)
-        most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
-        state = _moved(state, np.clip(step, -most, most))
-        result, step = _step(views, state, start, prior)
+            best, step, cost, share = result, onward, now, 1.0
+        else:
+            share *= _SHORTER
     return best
+
+
+def _cost(result: MotionFit) -> float:
+    """Minus twice the log-likelihood, without the largest residuals; infinite without IMU."""
+    seen = result.squares[np.isfinite(result.squares)]
+    if not len(seen):
+        return np.inf
+    return 3 * len(seen) * np.log(trimmed(seen) + 1e-12) + result.strain
 
 
 def _moved(state: PairState, step: np.ndarray) -> PairState:

@@ -24,7 +24,7 @@ from robins.logs.motion import (
     squares_by_map,
     views_of,
 )
-from robins.logs.motion_fit import MotionFit, PairState, fit, prior_of, start_of
+from robins.logs.motion_fit import MotionFit, PairState, corrected, fit, prior_of, start_of
 from robins.logs.quiet import ImuSignal, usual_force, windows_of
 
 SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # gyro scales at which a fit may start
@@ -37,12 +37,12 @@ _BLOCKS = {
 _COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
 _SUSPICIOUS = 0.02, 0.3  # unexplained shares, of all and of a stretch, to search starts
-_NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.1, 0.5
+_CLOSE_S, _NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 5.0, 60.0, 4000.0, 0.1, 0.5
 _NOISY = 1.25  # residual squares, relative to the stated noise, that count as noise
-_SWITCH = 40.0, 12.0  # log-likelihoods that a clock step must gain to be tried
+_SWITCH = 12.0  # cost that a clock step must save to be tried
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
 _PART = 5.0  # log-likelihood that each part with an own offset must gain
-_PROMISING = {"clock": 3, "gyros": 2}  # number of starts from which a fit is tried
+_PROMISING = {"clock": 3, "scale": 1, "gyros": 2, "forces": 1}  # starts from which a fit is tried
 _ROUNDS = 14
 _LEAST_SHARE = 1e-4  # unexplained share below which no block is freed
 
@@ -133,51 +133,56 @@ def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tup
 
 
 def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]) -> MotionFit:
-    """A model with one more block, from the most promising start."""
-    trials = []
-    for start in _starts(views, block, best, free):
+    """A model with one more block, from the best fit so far or from the most promising start."""
+    known, starts = _starts(views, block, best, free)
+
+    def fitted(start: PairState, rounds: int, begin: PairState | None = None) -> MotionFit:
         parts = len(start.offset)
         names = [name for b in (*free, block) for name in _BLOCKS[b]]
         if parts > 1 and "rate" in names:
             names.remove("rate")
-        trials.append((start, prior_of(parts, *names)))
-    if len(trials) > 1:
-        seen = [_gain(views, best, fit(views, start, prior, 0)) for start, prior in trials]
-        promising = np.argsort(seen)[-_PROMISING.get(block, 1) :]
-        trials = [trials[k] for k in promising]
-    fits = [fit(views, start, prior, _ROUNDS) for start, prior in trials]
-    # an extra offset for a part of the log must pay off
-    gains = [_gain(views, best, one) - _PART * len(one.state.offset) for one in fits]
-    return fits[int(np.argmax(gains))]
+        return fit(views, start, prior_of(parts, *names), rounds, begin)
+
+    if len(starts) > _PROMISING[block]:
+        seen = [_gain(views, best, fitted(start, 0)) for start in starts]
+        different = np.unique(np.round(seen, 6), return_index=True)[1]
+        starts = [starts[k] for k in different[-_PROMISING[block] :]]
+    fits = [fitted(known, _ROUNDS, best.state), *(fitted(start, _ROUNDS) for start in starts)]
+    return fits[int(np.argmax([_gain(views, best, one) for one in fits]))]
 
 
 def _gain(views: MotionIntegrals, before: MotionFit, after: MotionFit) -> float:
-    """A third of the gain of log-likelihood, with a variance for each stretch."""
+    """A third of the gain of log-likelihood, with a variance for each stretch.
+
+    An extra offset for a part of the log must pay off.
+    """
     least = _LEAST_SHARE * float(np.median(power_of(views)))
     one, other = (np.log(f.by_stretch(views) + least) for f in (before, after))
     strain = (before.strain - after.strain) / 3.0
-    return 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
+    gain = 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
+    return gain - _PART * (len(after.state.offset) - len(before.state.offset))
 
 
 def _starts(
     views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]
-) -> list[PairState]:
-    """States from which a model with one more free block is fitted."""
+) -> tuple[PairState, list[PairState]]:
+    """Prior mean of a model with one more free block, and other states to start from."""
     state = _known(views, best.state, free)
-    out, power = [state], power_of(views)
+    out, power = [], power_of(views)
     share, noise = best.by_stretch(views) / power, views.noise**2 / power
     usual = _NOISY * views.noise**2 / float(np.mean(power))
     if block != "clock":  # not for a clock, of which a step of a second explains less
         usual = max(_SUSPICIOUS[0], usual)
-    if best.left(views) < usual and np.all(share < np.maximum(_SUSPICIOUS[1], 4.0 * noise)):
-        return out
+    odd = share > np.maximum(_SUSPICIOUS[1], 4.0 * noise)
+    far = bool(best.left(views) > usual or np.any(odd))
+    if far:
+        out.append(state)
     if block == "clock" and not {"gyros", "scale"} & {*free}:
-        out += _clocks(views)
-    if block == "gyros":
-        out += _maps(views, state, signed_permutations())
-    if block == "scale":
-        out += _maps(views, state, np.eye(3)[None])
-    return out
+        out += _clocks(views, best, far)
+    if far and block in ("gyros", "scale"):
+        axes = signed_permutations()
+        out += _maps(views, state, axes if block == "gyros" else axes[:1])
+    return state, out
 
 
 def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> PairState:
@@ -190,23 +195,35 @@ def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> P
     return out._replace(M_a=state.M_a) if "forces" in free else out
 
 
-def _clocks(views: MotionIntegrals) -> list[PairState]:
-    """Clock states that fit best: offset and rate, and offsets of parts."""
+def _clocks(views: MotionIntegrals, best: MotionFit, far: bool) -> list[PairState]:
+    """Clock states that fit best: offset and rate, and offsets of parts.
+
+    By the triads as labelled, and by those of the best fit so far, whose biases a small error of
+    the clock spoils little.
+    """
     last = (len(views.turn) - 1) / RATE_HZ
-    far = min(max(last, float(views.end_s[-1])), _FAR_S)
-    lags = np.arange(-_NEAR_S, _NEAR_S + 0.1, _FINE_S)
-    if far > _NEAR_S:
-        beyond = np.arange(_NEAR_S + _COARSE_S, far, _COARSE_S)
-        lags = np.concatenate([-beyond[::-1], lags, beyond])
-    squares = squares_by_lag(views, lags)
-    changes = np.bincount(views.of)[:, None] / views.stride
-    power = power_of(views)
+    farthest = min(max(last, float(views.end_s[-1])), _FAR_S) if far else 0.0
+    reach = _NEAR_S if far else _CLOSE_S
+    lags = np.arange(-reach, reach + 0.5 * _FINE_S, _FINE_S)
+    beyond = np.arange(reach + _COARSE_S, farthest, _COARSE_S)
+    start, out = start_of(views), []
+    for known, these in (
+        (views, np.concatenate([-beyond[::-1], lags, beyond])),
+        (corrected(views, best.state), lags),
+    ):
+        cost = _cost_by_lag(known, these)
+        steps = _steps(start, these, cost)
+        out += [_line(views, start, these, cost), *([steps] if steps.part[-1] else [])]
+    return out
+
+
+def _cost_by_lag(views: MotionIntegrals, lags: np.ndarray) -> np.ndarray:
+    """Log-likelihood ratios (stretches, lags) that count a change of velocity once, times -2/3."""
+    squares, power = squares_by_lag(views, lags), power_of(views)
     # without IMU, or at rest: nothing is explained
-    missing = np.isnan(squares)
-    left = np.where(missing, power[:, None], squares)
-    cost = changes * np.log(left + 1e-3 * np.median(power))
-    start = start_of(views)
-    return [_line(views, start, lags, cost), *(_steps(start, lags, cost, s) for s in _SWITCH)]
+    left = np.where(np.isnan(squares), power[:, None], squares)
+    changes = np.bincount(views.of)[:, None] / views.stride
+    return changes * np.log(left + _LEAST_SHARE * np.median(power))
 
 
 def _line(
@@ -228,21 +245,22 @@ def _line(
     return start._replace(offset=np.array([best[1]]), rate=best[2])
 
 
-def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray, switch: float) -> PairState:
-    """Offsets of parts: the path of least cost, with a penalty for each step (Viterbi 1967)."""
-    total, before = cost[0], []
-    for row in cost[1:]:
-        k = int(np.argmin(total))
-        stay = total <= total[k] + switch
-        before.append(np.where(stay, np.arange(len(lags)), k))
-        total = np.minimum(total, total[k] + switch) + row
-    path = [int(np.argmin(total))]
-    for came in reversed(before):
-        path.append(int(came[path[-1]]))
-    path = np.array(path[::-1])
-    part = np.concatenate([[0], np.cumsum(np.abs(np.diff(lags[path])) > 0.6)])
-    offset = np.array([np.median(lags[path[part == p]]) for p in range(part[-1] + 1)])
-    return start._replace(offset=offset, part=part)
+def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray) -> PairState:
+    """Offsets of parts: the log is cut where that lowers the cost most, and its parts again."""
+    first, bounds, done = 0, [len(cost)], []
+    while bounds:
+        part = cost[first : bounds[-1]]
+        before = np.cumsum(part, axis=0)
+        after = before[-1] - before
+        both = before.min(axis=1) + after.min(axis=1)  # of a cut after each stretch
+        k = int(np.argmin(both))
+        if both[k] < both[-1] - _SWITCH:
+            bounds.append(first + k + 1)
+        else:
+            done.append((first, float(lags[np.argmin(before[-1])])))
+            first = bounds.pop()
+    part = np.searchsorted([k for k, _ in done], np.arange(len(cost)), side="right") - 1
+    return start._replace(offset=np.array([lag for _, lag in done]), part=part)
 
 
 def _maps(views: MotionIntegrals, state: PairState, axes: np.ndarray) -> list[PairState]:
