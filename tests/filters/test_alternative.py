@@ -27,7 +27,7 @@ MODEL = Model(
 NARROW, ADDED = np.array([1.0, 0.1]), np.array([0.0, 8.0])
 START = Belief(jnp.zeros(2), jnp.diag(jnp.asarray(NARROW)))
 WIDE = Belief(jnp.zeros(2), jnp.diag(jnp.asarray(np.hypot(NARROW, ADDED))))
-FILTER = alternative(kalman(), ADDED, ["level"], NATS, "offset")
+FILTER = alternative(kalman(), ADDED, {"level": [np.inf]}, NATS, "offset")
 
 
 def levels(offset, until=STEPS, seed=0):
@@ -86,6 +86,21 @@ def test_it_is_the_first_run_until_the_second_is_likelier_and_then_the_second(of
     np.testing.assert_array_equal(taken, np.maximum.accumulate(np.array(want) > NATS))
 
 
+@pytest.mark.parametrize("size", [0.3, 8.0])
+def test_the_second_run_does_not_take_over_while_it_contradicts_what_is_stated(size):
+    y, judged = levels(6.0), alternative(kalman(), ADDED, {"level": [size]}, NATS, "offset")
+    both, other = ran(judged, START, y).info["level"], ran(kalman(), WIDE, y).info["level"]
+    square, want = 1.0, []
+    for r in np.asarray(other.innovation)[:, 0]:
+        square = square if np.isnan(r) else 0.95 * square + 0.05 * (r / size) ** 2
+        want.append(square < 10.0)
+    likelier = np.asarray(both.notes["alternative.evidence"]) > NATS
+    taken = np.asarray(both.notes[WRONG])[:, 0] > 0.0
+    np.testing.assert_array_equal(taken, np.maximum.accumulate(likelier & want))
+    assert np.any(likelier & ~np.array(want)) == (size == 0.3)
+    assert taken[-1]
+
+
 def test_it_names_what_is_wrong_and_goes_on_from_another_belief():
     assert FILTER.suspects == ("offset",)
     begun = FILTER.init(START, MODEL.dims)
@@ -99,10 +114,11 @@ def test_it_names_what_is_wrong_and_goes_on_from_another_belief():
 @pytest.mark.parametrize(
     ("spread", "judging", "nats", "word"),
     [
-        ([0.0, -1.0], ["level"], 1.0, "finite numbers from 0 up"),
-        ([[0.0, 1.0]], ["level"], 1.0, "must be a vector"),
-        ([0.0, 1.0], ["level"], 0.0, "nats of an alternative must be positive"),
-        ([0.0, 1.0], [], 1.0, "needs a sensor that judges"),
+        ([0.0, -1.0], {"level": [1.0]}, 1.0, "finite numbers from 0 up"),
+        ([[0.0, 1.0]], {"level": [1.0]}, 1.0, "must be a vector"),
+        ([0.0, 1.0], {"level": [1.0]}, 0.0, "nats of an alternative must be positive"),
+        ([0.0, 1.0], {"level": [0.0]}, 1.0, "level of an alternative must be positive"),
+        ([0.0, 1.0], {}, 1.0, "needs a sensor that judges"),
     ],
 )
 def test_bad_arguments_are_named(spread, judging, nats, word):
@@ -112,7 +128,11 @@ def test_bad_arguments_are_named(spread, judging, nats, word):
 
 @pytest.mark.parametrize(
     ("spread", "judging", "word"),
-    [([0.0, 1.0], ["depth"], "no such sensor"), ([1.0], ["level"], "needs 2 numbers")],
+    [
+        ([0.0, 1.0], {"depth": [1.0]}, "no such sensor"),
+        ([1.0], {"level": [1.0]}, "spread of an alternative needs 2 numbers"),
+        ([0.0, 1.0], {"level": [1.0, 1.0]}, "level of an alternative needs 1 numbers"),
+    ],
 )
 def test_what_does_not_fit_the_model_is_named(spread, judging, word):
     with pytest.raises(ValueError, match=word):

@@ -124,7 +124,12 @@ def one_prior(parameters: MargReplay) -> Filter:
 
 
 def filter_of(parameters: MargReplay) -> Filter:
-    """Filter of a log; widens the prior of the gyro gains once an uncalibrated chip is likelier."""
-    gyro, spread = parameters.gyro, np.zeros(model.DIM)
+    """Filter of a log; widens the prior of the gyro gains once an uncalibrated chip is likelier.
+
+    Its own velocity and place must be within the stated travel, or wide gains only explain some of
+    the travel of a vehicle. A wrong tilt shows in their horizontal components.
+    """
+    gyro, travel, spread = parameters.gyro, parameters.travel, np.zeros(model.DIM)
     spread[model.GAINS] = gyro.bare_gain
-    return alternative(one_prior(parameters), spread, [model.TRAVEL], _NATS, BARE)
+    sizes = [size for s in (travel.velocity, travel.place) for size in (s, s, np.inf)]
+    return alternative(one_prior(parameters), spread, {model.TRAVEL: sizes}, _NATS, BARE)
