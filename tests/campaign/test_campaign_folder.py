@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 
+from robins import workbench
 from robins.campaign import plan as plans
 from robins.campaign import simulate
 from robins.campaign.gather import gather
@@ -303,9 +304,9 @@ def test_a_second_coordinator_waits_for_the_report_of_the_first(tmp_path, monkey
         asked.append((to, options["patience_s"]))
         return SimpleNamespace(path=tmp_path, report="")
 
-    bench, outcome = SimpleNamespace(publish=publish), Outcome()
-    coordinating._deliver(bench, "out", outcome, True)
-    coordinating._deliver(bench, "out", outcome, True, tmp_path / "elsewhere")
+    monkeypatch.setattr(workbench, "publish", publish)
+    coordinating._deliver(workbench, "out", Outcome(), True)
+    coordinating._deliver(workbench, "out", Outcome(), True, tmp_path / "elsewhere")
     assert asked == [(Path("out/report"), 600.0), (tmp_path / "elsewhere", 0.0)]
 
 

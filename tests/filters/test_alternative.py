@@ -117,7 +117,8 @@ def test_it_names_what_is_wrong_and_goes_on_from_another_belief():
         ([0.0, -1.0], {"level": [1.0]}, 1.0, "finite numbers from 0 up"),
         ([[0.0, 1.0]], {"level": [1.0]}, 1.0, "must be a vector"),
         ([0.0, 1.0], {"level": [1.0]}, 0.0, "nats of an alternative must be positive"),
-        ([0.0, 1.0], {"level": [0.0]}, 1.0, "level of an alternative must be positive"),
+        ([0.0, 1.0], {"level": [0.0]}, 1.0, "level of an alternative must be a vector of positive"),
+        ([0.0, 1.0], {"level": 1.0}, 1.0, "level of an alternative must be a vector of positive"),
         ([0.0, 1.0], {}, 1.0, "needs a sensor that judges"),
     ],
 )

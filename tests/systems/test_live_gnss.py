@@ -1,5 +1,6 @@
 """Tight GNSS live: the bits of a replay for any chunks, columns, refusals, and what is kept."""
 
+import inspect
 import math
 import pickle
 from collections import OrderedDict
@@ -13,6 +14,7 @@ import pytest
 
 from robins.filters import Belief, Code, kalman
 from robins.logs import load_ranges
+from robins.program.names import by_name
 from robins.results import ResultError, ignore_progress
 from robins.systems import replaying
 from robins.systems.gnss import GnssReplay, LiveGnss, gnss_model
@@ -221,6 +223,14 @@ def test_a_satellite_takes_the_column_that_was_not_used_for_longest(log):
     assert path.dropped == 1
 
 
+@pytest.mark.parametrize("delays", [True, False])
+def test_its_programs_have_a_name_in_the_cache(delays):
+    built = gnss_model(PARAMETERS, GnssModelKind(delays=delays), BERLIN, np.zeros((4, 0)))
+    structure = jax.tree_util.tree_structure(built)
+    assert by_name(structure)
+    assert jax.tree_util.tree_structure(pickle.loads(pickle.dumps(built))) == structure
+
+
 def test_a_new_satellite_forgets_the_delay_of_its_column():
     """The covariance of the delay, after a step, is that of the law, free of all others."""
     member = np.zeros((4, 0))
@@ -413,11 +423,13 @@ def test_bad_records_are_refused_and_counted(live, log):
         live.push_odometry(True, 1.0, 0.0, 0.1, 0.01)
     with pytest.raises(LiveError, match="by its name, once"):
         push(live, EPOCH, (t + 2, [names[0]] * len(names), rows))
+    columns = *rows.T[:2], rows[:, 2:5], *rows.T[5:]
+    as_users_call = partial(inspect.unwrap(LiveGnss.push_ranges), live)  # without checks of types
     with pytest.raises(LiveError, match="by its name, once"):
-        push(live, EPOCH, (t + 2, [["G"], *names[1:]], rows))
+        as_users_call(t + 2, [["G"], *names[1:]], *columns)
     for strange in ("G05",):
         with pytest.raises(LiveError, match="names such as"):
-            live.push_ranges(t + 2, strange, *rows.T[:2], rows[:, 2:5], *rows.T[5:])
+            live.push_ranges(t + 2, strange, *columns)
     with pytest.raises(LiveError, match="satellite_e"):
         live.push_ranges(t + 2, names, *rows[:, :2].T, rows[:, 2:5].T, *rows[:, 5:].T)
     with pytest.raises(LiveError, match="is no time"):

@@ -25,10 +25,11 @@ def examples(*lines: str) -> str:
 
 def examples_in(text: str | None) -> Mapping[str, str]:
     """Examples of each command in the docstring of a module, by the last word of their heading."""
-    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text or "")
+    if text is None:  # by python -OO
+        return defaultdict(str)
+    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text)
     blocks = (map(str.strip, part.strip().splitlines()) for part in parts[1::2])
-    found = {name: examples(*lines) for name, lines in zip(parts[::2], blocks, strict=True)}
-    return defaultdict(str, found)  # python -OO keeps no docstring
+    return {name: examples(*lines) for name, lines in zip(parts[::2], blocks, strict=True)}
 
 
 Callback = Callable[[click.Context, click.Parameter, Any], Any]

@@ -242,7 +242,8 @@ def fit(
         begin: initial state, by default the prior mean.
     """
     best, step = _step(views, begin or start, start, prior)
-    cost, share = _cost(best), 1.0
+    count = int(np.sum(np.isfinite(best.squares)))
+    cost, share = _cost(best, count), 1.0
     most = np.full(len(step), _MOST)
     most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
     for _ in range(rounds):
@@ -250,7 +251,7 @@ def fit(
             break
         state = _moved(best.state, share * np.clip(step, -most, most))
         result, onward = _step(views, state, start, prior)
-        now = _cost(result)
+        now = _cost(result, count)
         if now < cost:
             best, step, cost, share = result, onward, now, 1.0
         else:
@@ -258,12 +259,16 @@ def fit(
     return best
 
 
-def _cost(result: MotionFit) -> float:
-    """Minus twice the log-likelihood, without the largest residuals; infinite without IMU."""
+def _cost(result: MotionFit, count: int) -> float:
+    """Minus twice the log-likelihood of a number of changes; infinite without IMU.
+
+    It is that of the mean without the largest residuals. A state by which fewer changes are within
+    the log has the cost of as many.
+    """
     seen = result.squares[np.isfinite(result.squares)]
     if not len(seen):
         return np.inf
-    return 3 * len(seen) * np.log(trimmed(seen) + 1e-12) + result.strain
+    return 3 * count * np.log(trimmed(seen) + 1e-12) + result.strain
 
 
 def _moved(state: PairState, step: np.ndarray) -> PairState:

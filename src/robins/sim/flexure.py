@@ -74,7 +74,8 @@ def swing(flexure: Flexure, dt_s: ArrayLike) -> tuple[Float[Array, "6 6"], Float
 
 def stationary_sigma(flexure: Flexure) -> np.ndarray:
     """Standard deviations (6,) of the angles and then the rates, without correlations."""
-    sigma, tau = (np.asarray(x, float) for x in (flexure.sigma_rad, flexure.tau_s))
+    given = (flexure.sigma_rad, flexure.tau_s)
+    sigma, tau = (np.broadcast_to(np.asarray(x, float), 3) for x in given)
     return np.concatenate([sigma, sigma * _WN_TAU / tau])
 
 

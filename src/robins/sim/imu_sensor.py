@@ -271,7 +271,7 @@ def _truth(imu: SimulatedImu, seen) -> ImuTruth:
     none = jnp.zeros((3, 3))
 
     def of(triad: _Triad, bias: Array, clipped: Array) -> TriadTruth:
-        matrix, bent = (none if m is None else m for m in triad[2:])
+        matrix, bent = (none if m is None else m for m in (triad.matrix, triad.g_sensitivity))
         return TriadTruth(bias, clipped, matrix, bent)
 
     return ImuTruth(of(imu.gyro, *seen[0]), of(imu.accel, *seen[1]))

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
-from robins.errors import require
+from robins.errors import require, require_kind
 from robins.filters.belief import Belief
 from robins.filters.kalman import WRONG, Advanced, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Given, Motion, Sensor
@@ -29,6 +29,7 @@ from robins.linalg.rows import each_row
 
 T = TypeVar("T")
 _REMEMBERED, _MOST_SQUARE = 20.0, 10.0  # innovations in a mean square, and its limit
+_MOST_RATIO = 1e3  # larger innovations count as this, so that the mean square stays finite
 
 
 @value
@@ -110,7 +111,7 @@ def _one(tree: T, second: Array) -> T:
 
 def _aged(square: Array, ratio: Array) -> Array:
     """Mean square after a ratio (m,) of innovations to their sizes; 0 does not count, nor NaN."""
-    ratio = jnp.where(jnp.isfinite(ratio), ratio, 0.0)
+    ratio = jnp.where(jnp.isfinite(ratio), jnp.minimum(jnp.abs(ratio), _MOST_RATIO), 0.0)
     count = jnp.sum((ratio != 0.0).astype(float))
     mean = jnp.sum(ratio**2) / jnp.maximum(count, 1.0)
     return jnp.where(count > 0.0, square + (mean - square) / _REMEMBERED, square)
@@ -145,9 +146,11 @@ def alternative(
     spread = np.asarray(spread, float)
     if spread.ndim != 1 or not np.all(np.isfinite(spread) & (spread >= 0.0)):
         raise ValueError("spread of an alternative must be a vector of finite numbers from 0 up")
+    require_kind(judging, Mapping, "judging of an alternative")
     require(nats > 0.0, "nats of an alternative must be positive", nats)
     require(len(judging) > 0, "an alternative needs a sensor that judges")
     sizes = tuple(np.asarray(size, float) for size in judging.values())
     for name, size in zip(judging, sizes, strict=True):
-        require(bool(np.all(size > 0.0)), f"{name} of an alternative must be positive", size)
+        fine = size.ndim == 1 and bool(np.all(size > 0.0))
+        require(fine, f"{name} of an alternative must be a vector of positive numbers", size)
     return Alternative(inner, spread, np.asarray(float(nats)), sizes, tuple(judging), wrong)

@@ -34,7 +34,6 @@ The clock's noise is that of Brown & Hwang (2012, sec. 9.3)::
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -186,7 +185,12 @@ def _noise(memory: bool, numbers: tuple[Array, Array], x: GnssState, u: MotionSt
     return jnp.concatenate([place, *rest])
 
 
-_NOISE = {memory: partial(_noise, memory) for memory in (True, False)}
+def _noise_kept(numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Array:
+    return _noise(True, numbers, x, u)
+
+
+def _noise_free(numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Array:
+    return _noise(False, numbers, x, u)
 
 
 def pseudoranges(place: LocalFrame, member: Array, x: GnssState, sky: Sky) -> Array:
@@ -219,7 +223,7 @@ def gnss_model(
     """
     scales = jnp.array([believed.delays.time, believed.delays.distance])
     walks = jnp.array([believed.wheels.rise, *clock_density(believed.clock)])
-    noise = Partial(_NOISE[kind.memory], (walks, scales))
+    noise = Partial(_noise_kept if kind.memory else _noise_free, (walks, scales))
     membership = jnp.asarray(member, float)
     return Model(
         Motion(Partial(_step, scales), noise),

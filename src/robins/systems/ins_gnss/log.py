@@ -245,7 +245,7 @@ def measured_rest(
     if aids.non_holonomic:
         y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
     about: dict[str, Any] = {model.ROAD: rate} if aids.non_holonomic else {}
-    if log.wheels is not None and len(log.wheels[0]) > 1:
+    if log.wheels is not None and len(log.wheels.time_s) > 1:
         t, speed, sigma = log.wheels
         near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
         received = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])

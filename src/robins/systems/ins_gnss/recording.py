@@ -17,8 +17,12 @@ from robins.systems.ins_gnss.parameters import InsGnssReplay, UnknownReceiver
 TYRES = 0.02  # relative sigma of the wheel speed due to tyres, pressure, slip
 
 
-WheelSpeed = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Times (W,) [s], forward speed (W,) [m/s] by the wheels, and its sigma, including `TYRES`."""
+class WheelSpeed(NamedTuple):
+    """Forward speed measured by the wheels."""
+
+    time_s: np.ndarray  # (W,)
+    speed: np.ndarray  # (W,) m/s
+    sigma: np.ndarray  # (W,) m/s, including `TYRES`
 
 
 class Log(NamedTuple):
@@ -148,7 +152,7 @@ def _wheels(dataset: Dataset, origin_ns: int) -> WheelSpeed | None:
     order = order[np.isfinite(rows.speed_mps[order]) & (rows.sigma_speed[order] > 0.0)]
     speed = rows.speed_mps[order]
     sigma = np.hypot(rows.sigma_speed[order], TYRES * speed)
-    return (rows.time_ns[order] - origin_ns) * 1e-9, speed, sigma
+    return WheelSpeed((rows.time_ns[order] - origin_ns) * 1e-9, speed, sigma)
 
 
 def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -197,8 +197,8 @@ def evidence_of(log: Log, speed: float, wait_s: float) -> list[Evidence]:
         noise = np.max(log.sigma_v[known, :2], axis=1)
         evidence.append(_by_speed(log.gnss_s[known], size, noise, speed))
     if log.wheels is not None:
-        time_s, forward, sigma = log.wheels
-        evidence.append(_by_speed(time_s, np.abs(forward), sigma, speed))
+        w = log.wheels
+        evidence.append(_by_speed(w.time_s, np.abs(w.speed), w.sigma, speed))
     return evidence
 
 

@@ -207,7 +207,8 @@ def _read_off(
     fix: Fix,
 ):
     error = jnp.asarray(off) * x.offset
-    if lasting is not None and x.lasting is not None:
+    if lasting is not None:
+        assert x.lasting is not None
         error = error + jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
     return read(x.ins, fix).retract(error)
 

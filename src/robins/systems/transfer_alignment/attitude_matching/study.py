@@ -47,14 +47,16 @@ TOLD = {
 }
 
 
-# The paper's filter: the unit in which R = I, L = I and gamma; two are variants of it.
+# The paper's filter: the unit in which R = I, L = I and gamma. Of its variants some have P0 = I in
+# that unit too, some no bound: gamma = inf.
 IN_UNIT = {
     "hinf-rad": "rad",
-    "hinf-rad-identity": "rad",  # P0 = I in that unit too
+    "hinf-rad-identity": "rad",
     "hinf-deg": "deg",
-    "hinf-deg-inf": "deg",  # gamma = inf
+    "hinf-deg-inf": "deg",
     "hinf-arcmin": "arcmin",
 }
+IDENTITY, UNBOUNDED = {"hinf-rad-identity"}, {"hinf-deg-inf"}
 FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted", "adaptive")
 
 
@@ -96,9 +98,9 @@ def contender(given: AttitudeMatching, course: MatchingCourse, name: str) -> Con
         facts = existence(weighted_filter(), system, sigma, course, over_least=share)
         return _contender(weighted_filter(), system, sigma, facts)
     one = units.parse(f"1 {IN_UNIT[name]}", "angle")
-    if name == "hinf-rad-identity":
+    if name in IDENTITY:
         system = system._replace(sigma=np.full(am.STATES, one))
-    gamma = np.inf if name == "hinf-deg-inf" else given.h_infinity.gamma * one
+    gamma = np.inf if name in UNBOUNDED else given.h_infinity.gamma * one
     facts = existence(central_filter(), system, one, course, gamma)
     return _contender(central_filter(), system, one, facts, one)
 

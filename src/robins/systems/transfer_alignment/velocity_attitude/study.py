@@ -186,13 +186,16 @@ def simulate(
 # ------------------------------------------------------------------------- assumptions of filters
 
 
-def believed_noise(
-    given: VelocityAttitude, name: str, epoch_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Standard deviations assumed by a filter: those of the data sheets, of the worst axis.
+class BelievedNoises(NamedTuple):
+    """Assumed noise at each epoch, standard deviations."""
 
-    They are of the process (E, 12), the velocity (E, 2) [m/s], and heading, pitch, roll (E, 3)
-    [rad].
+    process: Any  # (E, 12)
+    velocity: Any  # (E, 2) m/s
+    attitude: Any  # (E, 3) rad, heading, pitch, roll
+
+
+def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> BelievedNoises:
+    """Noise assumed by a filter: that of the data sheets, of the worst axis where axes differ.
 
     A filter "told r" adds the variance of outliers in all measurements and of flexure in attitude;
     one "told q" the gyro noise in its window, and a random walk of the drift from its step on.
@@ -205,7 +208,7 @@ def believed_noise(
     rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
     process, velocity, attitude = (np.tile(row, (len(epoch_s), 1)) for row in rows)
     if name == "hinf-patent-weights":  # R = I in SI units, whatever that means
-        return process, np.ones_like(velocity), np.ones_like(attitude)
+        return BelievedNoises(process, np.ones_like(velocity), np.ones_like(attitude))
     if "r" in told:
         factor = math.sqrt(1.0 + d.outlier_share * (d.outlier_factor**2 - 1.0))
         roll, pitch, heading = given.told.flexure.sigma
@@ -220,7 +223,7 @@ def believed_noise(
         step = np.abs(np.asarray(swap(np.asarray(d.drift_step))))
         walk = step / math.sqrt(max(np.count_nonzero(after), 1))
         process[after, va.EPS] = np.hypot(process[after, va.EPS], walk)
-    return process, velocity, attitude
+    return BelievedNoises(process, velocity, attitude)
 
 
 def start_sigma(given: VelocityAttitude) -> np.ndarray:
@@ -237,14 +240,17 @@ def start_sigma(given: VelocityAttitude) -> np.ndarray:
     return sigma
 
 
-def _case(noise: list[Array], sigma: Array, dt_s: Array, world: VelocityAttitudeWorld) -> Case:
+def _case(noise: BelievedNoises, sigma: Array, dt_s: Array, world: VelocityAttitudeWorld) -> Case:
     """Case of a filter of twelve states in a run; pure, and its numbers are data."""
-    (process, velocity, attitude), count = noise, world.error.shape[0]
+    count = world.error.shape[0]
     return Case(
         start=Belief(jnp.zeros(va.STATES), jnp.diag(sigma)),
-        u=va.Interval(world.flight, jnp.broadcast_to(dt_s, (count,)), process),
+        u=va.Interval(world.flight, jnp.broadcast_to(dt_s, (count,)), noise.process),
         y={va.VELOCITY_SENSOR: world.velocity, va.ATTITUDE_SENSOR: world.attitude},
-        aux={va.VELOCITY_SENSOR: velocity, va.ATTITUDE_SENSOR: (world.C_nb, attitude)},
+        aux={
+            va.VELOCITY_SENSOR: noise.velocity,
+            va.ATTITUDE_SENSOR: (world.C_nb, noise.attitude),
+        },
         truth=world.error,
     )
 
@@ -252,7 +258,7 @@ def _case(noise: list[Array], sigma: Array, dt_s: Array, world: VelocityAttitude
 def _case_of(
     given: VelocityAttitude, name: str, epoch_s: np.ndarray
 ) -> Callable[[VelocityAttitudeWorld], Case]:
-    noise = [jnp.asarray(a) for a in believed_noise(given, name, epoch_s)]
+    noise = BelievedNoises(*(jnp.asarray(a) for a in believed_noise(given, name, epoch_s)))
     return Partial(
         _case, noise, jnp.asarray(start_sigma(given)), jnp.asarray(1.0 / given.master.rate)
     )
