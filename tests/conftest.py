@@ -105,14 +105,25 @@ def resident() -> int:
     return int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def pytest_runtest_teardown(item):
-    """Forget compiled programs when there are many; the cache gives back those needed again."""
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Forget what a file computed once, after it, and compiled programs when there are many.
+
+    The cache gives back those needed again.
+    """
+    if nextitem is None or nextitem.module is not item.module:
+        for kept in vars(item.module).values():
+            # those of a helper are for several files
+            if hasattr(kept, "cache_clear") and kept.__module__ == item.module.__name__:
+                kept.cache_clear()
     if not MAPS.exists():
         return
     count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
     large = resident() > item.config.stash.setdefault(LEFT, resident()) + MANY_BYTES
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
+        if memory := sys.modules.get("robins.program.memory"):
+            memory._known.clear()
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
         item.config.stash[LEFT] = resident()
