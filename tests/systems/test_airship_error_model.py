@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import two_mechanisations as tm
+from ins.ins_states import error_dynamics
 from numpy.testing import assert_allclose
 
 from robins.earth import Geodetic, gravity_n
-from robins.ins.errors import error_dynamics
 from robins.ins.frames import swap
 from robins.ins.mechanise import Nav
 from robins.manifold import local, retract

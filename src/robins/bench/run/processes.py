@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,25 +19,30 @@ from robins.bench.parts.idle import idleness
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
+from robins.errors import RobinsError
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 _GRACE_S = 2.0  # between the signal to stop and the kill
 
 
-@dataclass(eq=False)
-class ProcessExit(Exception):
-    """A process that has ended; raised where it has to be there."""
+class ProcessExit(RobinsError):
+    """A process that has ended; raised where it has to be there.
 
-    part: str
-    code: int  # negative: the signal that ended it
-    error_output: str  # its last output on standard error
+    Attributes:
+        part: whose process it was.
+        code: status; negative: the signal that ended it.
+        error_output: its last output on standard error.
+    """
 
-    def __str__(self) -> str:
-        how = f"ended with status {self.code}"
-        if self.code < 0:
+    bad_input = False
+
+    def __init__(self, part: str, code: int, error_output: str):
+        self.part, self.code, self.error_output = part, code, error_output
+        how = f"ended with status {code}"
+        if code < 0:
             with contextlib.suppress(ValueError):
-                how = f"was killed by {signal.Signals(-self.code).name}"
-        return f"'{self.part}' {how}" + (f": {self.error_output}" if self.error_output else "")
+                how = f"was killed by {signal.Signals(-code).name}"
+        super().__init__(f"'{part}' {how}" + (f": {error_output}" if error_output else ""))
 
 
 class PartProcesses:
