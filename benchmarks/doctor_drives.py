@@ -1,6 +1,7 @@
 """Shares of random drives in which the doctor finds a fault of IMU and receiver, and its size.
 
 python benchmarks/doctor_drives.py --seed 1000 --sound 200 --drives 30
+python benchmarks/doctor_drives.py --seed 1000 --sound 0 --drives 0 --bare 60
 
 Sound drives must have no finding above a note. In a drive with a fault its code must be found, its
 value within three of its sigmas, and no other cause be named. Thresholds were chosen on `--seed 0`
@@ -44,13 +45,15 @@ def motion(rng, kind, t):
     begin = begin**3 * (10 - 15 * begin + 6 * begin**2)
     s = np.maximum(t - still, 0.0)
     zero = np.zeros_like(t)
-    if kind == "car":
+    if kind in ("car", "straight"):
         speed = begin * np.maximum(rng.uniform(8, 20) + waves(rng, s, rng.uniform(14, 50, 3), 2), 1)
         course = waves(rng, s, rng.uniform(14, 60, 3), 0.8)
         climb = begin * waves(rng, s, rng.uniform(15, 50, 2), 0.03)
         roll = begin * waves(rng, s, rng.uniform(3, 20, 3), 0.02)
         pitch = climb + begin * waves(rng, s, rng.uniform(3, 20, 3), 0.015)
         crab = zero
+        if kind == "straight":
+            course, climb, roll, pitch = 0.01 * course, 0.1 * climb, 0.1 * roll, 0.1 * pitch
     elif kind == "walk":
         speed = begin * (1.4 + waves(rng, s, rng.uniform(5, 20, 3), 0.2))
         course = waves(rng, s, rng.uniform(6, 30, 3), 0.8)
@@ -130,10 +133,11 @@ def truth_of(rng, kind, seconds, rate):
     return Truth(t, gyro, accel, np.stack([lat, lon, h], -1), v, C)
 
 
-def sound(seed, lever=(0.0, 0.0, 0.0)):
+def sound(seed, lever=(0.0, 0.0, 0.0), straight=False):
     """A random drive without a fault, whose antenna is some metres from the IMU."""
     rng = np.random.default_rng(seed)
     kind = ("car", "car", "aircraft", "walk")[rng.integers(4)]
+    kind = "straight" if straight else kind
     imu_hz = int(rng.choice([25, 50, 100, 200, 400]))
     fix_hz = float(rng.choice([0.2, 0.5, 1, 2, 5, 10]))
     seconds = rng.uniform(200, 400) * (1 if fix_hz >= 1 else 2)
@@ -190,6 +194,17 @@ def sound(seed, lever=(0.0, 0.0, 0.0)):
     )
     words = f"{seed} {kind}, IMU {imu_hz} Hz, fixes {fix_hz:g} Hz"
     return Dataset(f"{words}, {sigma_m} m{', no velocities' if without else ''}", imu, gnss)
+
+
+def bare(seed):
+    """A sound drive of positions alone, with noise of 0.02 to 5 m that is not stated."""
+    d, rng = sound(seed, straight=seed % 2 == 1), np.random.default_rng([seed, 1])
+    noise_m = 0.02 * 250.0 ** rng.random()
+    scale = np.stack([0 * d.gnss.lat_rad + A, A * np.cos(d.gnss.lat_rad), 0 * d.gnss.lat_rad + 1])
+    off = noise_m * np.array([1.0, 1.0, 2.0]) * rng.normal(size=(len(d.gnss), 3)) / scale.T
+    place = np.stack([d.gnss.lat_rad, d.gnss.lon_rad, d.gnss.alt_m], -1) + off
+    gnss = GnssTable(d.gnss.time_ns, *place.T, np.full(place.shape, np.nan), source="fixes.csv")
+    return replace(d, name=f"{d.name}, {noise_m:.2f} m more", gnss=gnss)
 
 
 class Fault(NamedTuple):
@@ -365,10 +380,11 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sound", type=int, default=20, help="drives without a fault")
     parser.add_argument("--drives", type=int, default=8, help="drives for each fault")
+    parser.add_argument("--bare", type=int, default=0, help="sound drives of positions alone")
     parser.add_argument("--only", default="", help="faults whose names hold this")
     parser.add_argument("--why", action="store_true", help="print what was not found")
     args = parser.parse_args()
-    began, above, others, checked, why, good = time.process_time(), 0, 0, 0, [], []
+    began, above, others, checked, spoilt, why, good = time.process_time(), 0, 0, 0, 0, [], []
     for k in range(max(args.sound, args.drives * 2)):
         drive = sound(args.seed + k)
         if k < args.sound or len(good) < args.drives:
@@ -391,6 +407,16 @@ def main():
         f"{args.sound} sound drives, {checked} with enough motion. Findings above a note: by their"
     )
     print(f"motion in {above}, others in {others}; {each:.2f} s of processor time each")
+    for k in range(args.bare):
+        drive = bare(args.seed + k)
+        bad = [f for f in examine(drive) if f.severity != "note"]
+        why += [f"bare: {drive.name}: {f}" for f in bad]
+        spoilt = spoilt + bool(bad)
+    if args.bare:
+        print(
+            f"{args.bare} sound drives of positions alone, half of them straight, without sigmas:"
+        )
+        print(f"findings above a note in {spoilt}")
     names = f"{'drives':>6}{'unknown':>8}{'found':>7}{'in 3 s':>8}{'wrong':>8}"
     print(f"{'fault':<22}{names}  codes above a note")
     for name, fault in FAULTS.items():

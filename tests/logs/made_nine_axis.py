@@ -84,3 +84,21 @@ def tumble_dataset(seconds=40.0):
         mag=MagTable(time_ns, a["imu_mag"] * 1e-6, source=name),
         attitude=AttitudeTable(time_ns, a["opt_quat"], "ENU", moving=a["movement"], source=name),
     )
+
+
+def level_dataset():
+    """Flat on a table, turned slowly by 90 degrees about the vertical and back; z up."""
+    rng = np.random.default_rng(5)
+    t = np.arange(round(50.0 * HZ)) / HZ
+    rate_z = np.deg2rad(9.0) * ((t >= 10.0) & (t < 20.0)) - np.deg2rad(9.0) * (t >= 40.0)
+    heading = np.cumsum(rate_z) / HZ
+    field = np.einsum("nji,j->ni", matrices([0.0, 0.0, 1.0], heading), FIELD_ENU_UT)
+    gyro = rate_z[:, None] * [0.0, 0.0, 1.0] + 2e-3 * rng.standard_normal((len(t), 3))
+    force = np.array([0.0, 0.0, 9.81]) + 0.02 * rng.standard_normal((len(t), 3))
+    field = field + 0.3 * rng.standard_normal((len(t), 3))
+    time_ns, source = np.round(t * 1e9).astype(np.int64), "level.csv"
+    return Dataset(
+        "level",
+        ImuTable(time_ns, gyro, force, "rate", source=source, body="FLU"),
+        mag=MagTable(time_ns, field * 1e-6, source=source, body="FLU"),
+    )

@@ -5,7 +5,7 @@ from functools import cache, partial
 
 import numpy as np
 from made_logs import GNSS_HZ, IMU_HZ, START_NS, TOTAL_S, make_drive, motion, rows_of
-from made_nine_axis import tumble_dataset
+from made_nine_axis import level_dataset, tumble_dataset
 from made_pair import attitudes, make_by_hand, make_pair
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +38,7 @@ def spoil(base, part="", whole=False, rows=None, **columns):
 
 imu, gnss = partial(spoil, drive, "imu"), partial(spoil, drive, "gnss")
 with_imu, with_gnss = partial(imu, whole=True), partial(gnss, whole=True)
+level = partial(spoil, cache(level_dataset), "imu", True)
 mag, attitude, sensor = (partial(spoil, tumble, k, True) for k in ("mag", "attitude", "imu"))
 master, slave = partial(spoil, pair, "master", True), partial(spoil, pair, "imu", True)
 exact, hand = partial(spoil, exact_pair, "master", True), partial(spoil, by_hand)

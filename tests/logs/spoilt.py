@@ -26,6 +26,7 @@ from made_spoilt import (
     hand,
     imu,
     late,
+    level,
     mag,
     master,
     pair,
@@ -219,7 +220,14 @@ TURNING = {
     "gyro_axes": [(hand(gyro=columns(1, 0, 2)), "error: fit as (gyro_y, gyro_x, gyro_z)")],
 }
 
-MAG_AXES = {"field_axes": [(mag(field_t=columns(1, 2, 0)), "error: (field_z, field_x, field_y)")]}
+MAG_AXES = {
+    "field_axes": [(mag(field_t=columns(1, 2, 0)), "error: (field_z, field_x, field_y)")],
+    "field_turns_back": [(level(gyro=times([1, 1, -1])), "error: if they have the opposite sense")],
+    "gyro_unit": [
+        (level(gyro=np.rad2deg), "error: if the rates are multiplied by 0.01745 ... deg/s"),
+        (level(gyro=np.deg2rad), "error: if the rates are multiplied by 57.3 ... radians once"),
+    ],
+}
 
 ATTITUDE = {
     "attitude_missing": [(attitude(q_nb=times(np.nan)), "warning")],

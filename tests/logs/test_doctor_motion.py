@@ -8,7 +8,7 @@ from made_logs import found, rows_of, with_gnss, with_imu
 from made_pair import make_pair
 from made_spoilt import late
 
-from robins.dataset import Dataset, ImuTable
+from robins.dataset import Dataset, GnssTable, ImuTable
 from robins.logs import Finding, LogError, Mounting, examine, load_dataset
 
 
@@ -137,3 +137,39 @@ def test_any_one_column_of_nonsense_is_survived(drive):
 def test_tables_that_are_none_are_refused(drive):
     with pytest.raises(LogError, match="has shape"):
         examine(with_imu(drive, gyro=drive.imu.gyro[:5]))
+
+
+@pytest.mark.parametrize("noise_m", [0.05, 1.0, 4.0])
+def test_a_straight_drive_of_rough_positions_is_sound(noise_m):
+    """Positions alone, whose sigmas nobody states: their noise is no motion."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 60.0, 0.02)
+    force = np.where(t < 10.0, 0.0, np.where(t < 40.0, 0.5, -0.4))
+    way = np.cumsum(np.cumsum(force)) * 0.02**2
+    accel = np.stack([force, 0.0 * t, 0.0 * t - 9.81], -1) + 0.03 * rng.standard_normal((len(t), 3))
+    gyro = np.deg2rad(0.1) * rng.standard_normal((len(t), 3))
+    imu = ImuTable(np.round(t * 1e9).astype(np.int64), gyro, accel, "rate", source="imu.csv")
+    off = noise_m * np.array([1.0, 1.0, 2.0]) * rng.standard_normal((60, 3))
+    north, east = (way[::50] * part for part in (0.87, 0.5))
+    place = (0.84 + (north + off[:, 0]) / 6.37e6, 0.19 + (east + off[:, 1]) / 6.39e6 / 0.667)
+    fixes = GnssTable(
+        imu.time_ns[::50], *place, 500.0 + off[:, 2], np.full((60, 3), np.nan), source="fixes.csv"
+    )
+    assert [f for f in examine(Dataset("straight", imu, fixes)) if f.severity != "note"] == []
+
+
+def test_axes_that_were_hardly_turned_keep_their_names():
+    """Turned about x alone, with gyro x reversed: nothing tells y from z."""
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 60.0, 0.02)
+    rate = np.deg2rad(4.0) * (((t >= 10.0) & (t < 20.0)) * 1.0 - ((t >= 25.0) & (t < 35.0)))
+    roll = np.cumsum(rate) * 0.02
+    accel = -9.81 * np.stack([0.0 * t, np.sin(roll), np.cos(roll)], -1)
+    gyro = np.stack([-rate, 0.0 * t, 0.0 * t], -1) + np.deg2rad(0.1) * rng.standard_normal(
+        (len(t), 3)
+    )
+    noisy = accel + 0.03 * rng.standard_normal(accel.shape)
+    imu = ImuTable(np.round(t * 1e9).astype(np.int64), gyro, noisy, "rate", source="imu.csv")
+    (f,) = errors(imu)
+    assert "fit as (-gyro_x, gyro_y, gyro_z)" in f.sentence
+    assert f.sentence.endswith("It turned too little about the other axes to test them.")

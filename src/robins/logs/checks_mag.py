@@ -17,10 +17,17 @@ import numpy as np
 
 from robins.dataset import ImuTable, MagTable
 from robins.ins.plausible import EARTH_FIELD_T, FIELD_UNITS
-from robins.logs.checks_motion import words_of
+from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.findings import Finding, Severity
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
-from robins.logs.motion import at, signed_permutations, steps_of
+from robins.logs.motion import (
+    ImuSignal,
+    TurnSteps,
+    at,
+    signed_permutations,
+    steps_of,
+    turned_over,
+)
 from robins.logs.ordering import increasing
 from robins.logs.quiet import error, finding, longest_run, note, signal_of, usual_step_s, warning
 
@@ -32,6 +39,7 @@ _REPEATED = 0.2  # share of rows that repeat the previous one
 _SPREAD = 0.25  # of the magnitude, between its 5th and 95th percentiles
 _FAR = 0.3  # deviation of a disturbed sample, in usual magnitudes
 _TURNED = 0.02  # smallest spread of directions that determines a centre
+_STRONGEST = 5.0  # hard iron, in usual magnitudes
 _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change not explained by the gyros
 
 # Power of ten by which the numbers are too large -> severity, cause, remedy.
@@ -213,13 +221,14 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
     if signal is None or mag.body != imu.body:
         return
     time_s, field = _readings(mag, int(imu.time_ns[signal.rows[0]]))
+    other = list(_other_gyros(imu, mag, signal, time_s, field))
+    yield from other
     steps = steps_of(signal, time_s)
-    if steps is None:
+    if other or steps is None:
         return
     maps = signed_permutations()
     maps = maps[np.linalg.det(maps) > 0.0]
-    before, after = (at(when, time_s, field) for when in (steps.begin_s, steps.end_s))
-    left = _left_over(before, after, np.swapaxes(steps.C, 1, 2), maps)
+    left = _left_over(time_s, field, steps, maps)
     k = int(np.argmin(left))
     if left[0] < _WRONG or left[k] > min(_RIGHT, _BETTER * left[0]):
         return
@@ -229,6 +238,43 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
         "three of these reversed. The magnetometer is mounted otherwise than the gyros: exchange "
         "its columns so."
     )
+
+
+def _other_gyros(
+    imu: ImuTable, mag: MagTable, signal: ImuSignal, time_s: np.ndarray, field: np.ndarray
+) -> Iterator[Finding]:
+    """Finding about rates of the opposite sense or in another unit, by the turning of the field.
+
+    A unit that was turned slowly, about one axis, is enough: both differ from what it is by far.
+    """
+    for factor in (-1.0, *SCALES):
+        scaled = signal._replace(gyro=factor * signal.gyro)
+        steps = steps_of(scaled, time_s, slow=True)
+        if steps is None:
+            continue
+        given = turned_over(signal, steps.begin_s, steps.end_s)
+        left, before = (
+            float(_left_over(time_s, field, s, np.eye(3)[None])[0]) for s in (steps, given)
+        )
+        if before < _WRONG or left > min(_RIGHT, _BETTER * before):
+            continue
+        shown = (
+            f"the magnetic field does not turn as the gyros say ({min(before, 1.0):.0%} of its "
+            f"change is left over), but it does ({left:.0%})"
+        )
+        if factor < 0.0:
+            yield error(mag, "field_turns_back", before)(
+                f"{shown} if they have the opposite sense: a gyro about an axis that it was turned "
+                "about has the wrong sign, or axes of the magnetometer are exchanged or reversed. "
+                "Compare both with the data sheet."
+            )
+        else:
+            unit, mend = SCALES[factor]
+            yield error(imu, "gyro_unit", factor)(
+                f"{shown} if the rates are multiplied by {factor:.4g}. The gyro columns are "
+                f"probably {unit}: {mend}."
+            )
+        return
 
 
 def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -245,12 +291,18 @@ def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _left_over(
-    before: np.ndarray, after: np.ndarray, turn: np.ndarray, maps: np.ndarray
+    time_s: np.ndarray, field: np.ndarray, steps: TurnSteps, maps: np.ndarray
 ) -> np.ndarray:
-    """Share (h,) of the change of the field not explained by each map with its best offset."""
+    """Share (h,) of the change of the field not explained by each map with its best offset.
+
+    A rotation too small for the change would fit about a centre far away: no iron is that strong.
+    """
+    before, after = (at(when, time_s, field) for when in (steps.begin_s, steps.end_s))
+    turn = np.swapaxes(steps.C, 1, 2)
     rest = np.einsum("hij,nj->hni", maps, after)
     rest = rest - np.einsum("nij,hjk,nk->hni", turn, maps, before, optimize=True)
     by_offset = (np.eye(3) - turn).reshape(-1, 3)
     flat = rest.reshape(len(maps), -1).T
     offset = np.linalg.lstsq(by_offset, flat, rcond=1e-3)[0]
+    offset *= np.linalg.norm(offset, axis=0) < _STRONGEST
     return np.sum((flat - by_offset @ offset) ** 2, axis=0) / np.sum((after - before) ** 2)

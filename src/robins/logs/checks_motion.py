@@ -74,6 +74,7 @@ _LEAST_S, _LEAST_SCALE = 0.01, 0.01  # least sigmas of a clock and of a gyro sca
 _WELL, _CHI = 0.05, 3.0  # unexplained share for naming causes, or in stated noise
 _GOOD = 0.5  # largest unexplained share of consistent data
 _TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise for gravity alone
+_TIED = 1e-3  # difference of shares that noise makes
 _TURNED_SIGMA = 0.03  # sigma of a gyro scale from gravity alone
 
 
@@ -84,7 +85,7 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         return
     verdict = judge(imu, gnss, signal, track)
     left = np.inf if verdict is None else verdict.fit.left(verdict.views)
-    if verdict is None or not np.isfinite(left):
+    if verdict is None or not np.isfinite(left) or _hidden(verdict, left):
         yield note(imu, "motion_not_checked", 0)(
             "gyro unit, axes and time offset could not be checked against GNSS: there are no "
             "15 s of common data with enough acceleration for these fixes. Drive a figure of eight "
@@ -109,6 +110,11 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
     if not wrong:
         yield from _lever(gnss, found)
         yield from _forward(imu, gnss, found)
+
+
+def _hidden(verdict: ModelChoice, left: float) -> bool:
+    """True if the motion hardly stands out of the noise of the fixes, and no fault does."""
+    return not (verdict.free or verdict.rival) and left > _GOOD and explained(verdict)
 
 
 def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
@@ -224,8 +230,9 @@ def _unclear(
             "reversed axes, nor a shift of the clock explains it. Are the files of one recording, "
             "and is the IMU fixed to the vehicle?"
         )
+    moved = "velocities" if gnss.v_n is not None else "motion by the positions"
     yield warning(imu, "motion_disagrees", left)(
-        f"the IMU does not explain the velocities of {name_of(gnss)}{rest}"
+        f"the IMU does not explain the {moved} of {name_of(gnss)}{rest}"
     )
 
 
@@ -461,7 +468,7 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
     left = squares / np.sum(power_of(views))
     if not left[0] > _TURNED_WRONG:
         return
-    k = int(np.argmin(left))
+    k, tied = _simplest(maps, left)
     # A vehicle that only accelerates is explained without rotation, and gives no evidence on it.
     if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * left[0], 0.5 * left[-1]):
         return
@@ -479,7 +486,22 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
             "left-handed: two axes exchanged or one reversed, alike in both."
         )
     else:
+        hardly = " It turned too little about the other axes to test them." if tied else ""
         yield error(imu, "gyro_axes", float(left[k]))(
             f"{shown}. The gyros fit as {words_of(maps[k], 'gyro')}; or the accelerometers' "
-            "columns were exchanged or reversed accordingly."
+            f"columns were exchanged or reversed accordingly.{hardly}"
         )
+
+
+def _simplest(maps: np.ndarray, left: np.ndarray) -> tuple[int, bool]:
+    """Index of the map that changes fewest columns of those that fit about best, and if others do.
+
+    Args:
+        maps: (k, 3, 3) gyro maps.
+        left: (k,) unexplained share of each.
+    """
+    best = float(np.min(left))
+    near = np.flatnonzero(left <= max(1.5 * best, best + _TIED))
+    changed = np.any(np.abs(maps[near] - np.eye(3)) > 1e-9, axis=2).sum(axis=1)
+    order = np.lexsort((left[near], changed))
+    return int(near[order[0]]), len(near) > 1

@@ -271,6 +271,8 @@ TOGETHER = (
         unless="master",
     )(
         ("field_axes", "error", "it turns as the gyros say only with other columns"),
+        ("field_turns_back", "error", "it does only if the gyros have the opposite sense"),
+        ("gyro_unit", "error", "it does only with the gyros in another unit"),
     ),
     _check(
         "In the attitudes",

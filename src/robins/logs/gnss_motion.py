@@ -15,6 +15,8 @@ from robins.logs.ordering import increasing
 _BASE_S = 1.0
 _BASES_S = (_BASE_S, 2.0, 4.0, 8.0)  # the shortest one with enough motion is used
 _SPEED = 0.3  # m/s; a slower receiver is at rest
+_NORMAL = 0.6745  # median size of a standard normal number
+_USUAL_M = np.array([3.0, 3.0, 6.0])  # of a single fix in the open, north, east, down
 _KEPT = 0.9  # share of the steps, those that fit best, used for the delay of velocities
 
 
@@ -25,7 +27,8 @@ class FixTrack(NamedTuple):
     time_s: np.ndarray  # (m,) since the table's first row
     r_n: np.ndarray  # (m, 3) m north, east, down of the first fix
     v_n: np.ndarray | None  # (m, 3) m/s north, east, down
-    sigma_m: float  # horizontal position noise, median
+    sigma_m: float  # horizontal position noise of an axis, median
+    scatter_m: float  # position noise over all three axes, root of the sum of squares
     sigma_v: float  # velocity noise, median over all axes
 
 
@@ -56,9 +59,24 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> FixTrack | None:
         axis=-1,
     )
     sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))
-    sigma_m = float(np.median(gnss.sigma_m[rows][:, :2]))
+    sigma_m = _sigmas(gnss, rows, r_n)
     time_s = (gnss.time_ns[rows] - gnss.time_ns[0]) * 1e-9
-    return FixTrack(rows, time_s, r_n, v, sigma_m, sigma_v)
+    horizontal, scatter = float(np.mean(sigma_m[:2])), float(np.linalg.norm(sigma_m))
+    return FixTrack(rows, time_s, r_n, v, horizontal, scatter, sigma_v)
+
+
+def _sigmas(gnss: GnssTable, rows: np.ndarray, r_n: np.ndarray) -> np.ndarray:
+    """Median sigma of each axis (3,) [m]; where none is stated, by the roughness of the positions.
+
+    Third differences of white noise have 20 times its variance, and a vehicle adds little to most.
+    """
+    stated = np.array(gnss.sigma_m[rows])
+    if gnss.assumed_m is not None:
+        stated[gnss.assumed_m[rows]] = np.nan
+    rough = np.median(np.abs(np.diff(r_n, 3, axis=0)), axis=0) / (_NORMAL * np.sqrt(20.0))
+    lacking = np.isnan(stated).all(axis=0)
+    known = np.nanmedian(np.where(lacking, 0.0, stated), axis=0)
+    return np.where(lacking, np.minimum(rough, _USUAL_M), known)
 
 
 class PositionSteps(NamedTuple):

@@ -37,9 +37,9 @@ _FIX_S, _LOST_S = 0.25, 1.2  # least interval of fixes used; longest one in a st
 _NOISE = 0.5  # m/s, largest noise of a mean velocity between fixes, which sets their stride
 
 # Steps over which another rotating sensor is compared with the gyros.
-_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine steps, and compared over 0.2 s
+_FINE_S = 0.01  # rotations are composed of fine steps
+_FAST, _SLOW = (20, 50), (100, 8)  # fine steps of a step that is compared, fewest such steps
 _MOST = 1500  # most steps used, those with the largest rotation
-_LEAST = 50  # fewest steps for a comparison
 _TURNED = 0.1  # rad, least rotation of a useful step
 
 
@@ -86,7 +86,7 @@ def views_of(
     when_s: np.ndarray,
     r_n: np.ndarray,
     v_n: np.ndarray | None,
-    noise: tuple[float, float],
+    noise: tuple[float, float, float],
 ) -> MotionIntegrals | None:
     """Integrals and changes on a common time; None if no stretch has enough motion.
 
@@ -98,7 +98,8 @@ def views_of(
         when_s: (m,) times of the fixes, from the zero of the signal.
         r_n: (m, 3) positions, north-east-down [m].
         v_n: (m, 3) velocities, north-east-down [m/s]; None: positions are used.
-        noise: standard deviations of a position [m] and of a velocity [m/s].
+        noise: standard deviations of a position along a horizontal axis and over all axes [m], and
+            of a velocity along an axis [m/s].
     """
     spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if v_n is None else 1.0
     keep = np.arange(0, len(when_s), max(1, round(_FIX_S / float(np.median(np.diff(when_s))))))
@@ -108,7 +109,7 @@ def views_of(
         return None
     v, begin, end, joined = _velocities(when_s[keep], r_n[keep], v_n, keep, stride)
     means = v_n is None
-    scatter = np.sqrt(12.0) * noise[0] / (stride * step) if means else np.sqrt(6.0) * noise[1]
+    scatter = np.sqrt(6.0) * (noise[1] / (stride * step) if means else noise[2])
     length = max(_STRETCH_S, _CHANGES * stride * step)
     end_s = float(signal.time_s[-1]) + 0.1
     chosen = _lively(0.5 * (begin + end), v, joined, length, max(0.2, scatter), stride, end_s)
@@ -432,33 +433,42 @@ class TurnSteps(NamedTuple):
     C: np.ndarray  # (n, 3, 3) sensor axes at the end to those at the beginning
 
 
-def steps_of(signal: ImuSignal, time_s: np.ndarray) -> TurnSteps | None:
+def steps_of(signal: ImuSignal, time_s: np.ndarray, slow: bool = False) -> TurnSteps | None:
     """Steps with the largest rotation; None if there are too few.
 
     Args:
         signal: the IMU.
         time_s: (m,) increasing times of the other sensor, from the zero of the signal.
+        slow: compare over whole seconds, of which fewer are enough.
     """
     if len(time_s) < 2:
         return None
+    per_step, least = _SLOW if slow else _FAST
     begin, end = max(float(time_s[0]), 0.0), min(float(time_s[-1]), float(signal.time_s[-1]))
-    count = int((end - begin) / (_FINE_S * _PER_STEP))
-    if count < _LEAST:
+    count = int((end - begin) / (_FINE_S * per_step))
+    if count < least:
         return None
-    fine_s = begin + _FINE_S * np.arange(count * _PER_STEP + 1)
-    fine = np.diff(at(fine_s, signal.time_s, integral(signal.time_s, signal.gyro)), axis=0)
-    fine = fine.reshape(count, _PER_STEP, 3)
-    grid = fine_s[::_PER_STEP]
+    grid = begin + _FINE_S * per_step * np.arange(count + 1)
+    total = np.diff(at(grid, signal.time_s, integral(signal.time_s, signal.gyro)), axis=0)
     known = _recorded(grid, time_s) & _recorded(grid, signal.time_s)
-    angle = np.linalg.norm(fine.sum(axis=1), axis=1) * known
+    angle = np.linalg.norm(total, axis=1) * known
     chosen = np.sort(np.argsort(angle)[-_MOST:])
     chosen = chosen[angle[chosen] > _TURNED]
-    if len(chosen) < _LEAST:
+    if len(chosen) < least:
         return None
-    C = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
-    for k in range(_PER_STEP):
-        C = C @ rotations(fine[chosen, k])
-    return TurnSteps(grid[chosen], grid[chosen + 1], C)
+    return turned_over(signal, grid[chosen], grid[chosen + 1])
+
+
+def turned_over(signal: ImuSignal, begin_s: np.ndarray, end_s: np.ndarray) -> TurnSteps:
+    """Rotation of the IMU over steps of equal duration, composed of fine ones."""
+    count = max(1, round(float(end_s[0] - begin_s[0]) / _FINE_S))
+    fine_s = begin_s[:, None] + _FINE_S * np.arange(count + 1)
+    angles = at(fine_s.ravel(), signal.time_s, integral(signal.time_s, signal.gyro))
+    fine = np.diff(angles.reshape(len(begin_s), count + 1, 3), axis=1)
+    C = np.broadcast_to(np.eye(3), (len(begin_s), 3, 3))
+    for k in range(count):
+        C = C @ rotations(fine[:, k])
+    return TurnSteps(begin_s, end_s, C)
 
 
 def _recorded(grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:

@@ -77,7 +77,8 @@ def judge(
     late = velocity_delay(track) if late_s is None else late_s
     start_s = (int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])) * 1e-9
     when = track.time_s - start_s - (late or 0.0)
-    noise = track.sigma_m, track.sigma_v if np.isfinite(track.sigma_v) else 0.1
+    sigma_v = track.sigma_v if np.isfinite(track.sigma_v) else 0.1
+    noise = track.sigma_m, track.scatter_m, sigma_v
     views = views_of(scaled, imu.kind, gnss, track.rows, when, track.r_n, track.v_n, noise)
     if views is None:
         return None
