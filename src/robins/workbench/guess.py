@@ -302,20 +302,21 @@ def _prove_gyros(
     def tried(unit: str, why: str) -> Columns:
         return columns | {q: (columns[q][0], unit, why) for q in parts("gyro")}
 
-    fastest = float(np.nanmax(np.abs([numbers[q] for q in parts("gyro")])))
-    unit, why = "rad/s", f"GUESSED: it may be deg/s; largest number {fastest:.4g}"
-    if doubt := columns["gyro_x"][2]:
-        unit, why = "", doubt
-    elif fastest > _FASTEST:
-        unit, why = "deg/s", f"GUESSED: {fastest:.4g} rad/s is beyond the range of gyros"
     text = "\n".join([*settings, *_lines(tried("rad/s", ""))])
     try:
         opened = logs.open_log(path, format_of(text, os.fspath(path)), [])
     except logs.LogError:
         opened = None  # a unit is missing above
-    if opened is not None:
-        tables = tables_of(opened)
-        imu = next(table for table in tables if isinstance(table, ImuTable))
+    tables = () if opened is None else tables_of(opened)
+    imu = next((table for table in tables if isinstance(table, ImuTable)), None)
+    rates = np.array([numbers[q] for q in parts("gyro")]) if imu is None else imu.gyro
+    fastest = float(np.nanmax(np.abs(rates)))
+    unit, why = "rad/s", f"GUESSED: it may be deg/s; largest number {fastest:.4g}"
+    if doubt := columns["gyro_x"][2]:
+        unit, why = "", doubt
+    elif fastest > _FASTEST:
+        unit, why = "deg/s", f"GUESSED: {fastest:.4g} rad/s is beyond the range of gyros"
+    if imu is not None:
         others = [table for table in tables if table is not imu]
         scale, trust = _turned_by_gravity(imu)
         fitting = [u for u in (*KINDS["angle rate"], *_MILLI) if abs(scale / _si(u) - 1.0) < 0.15]
