@@ -87,14 +87,14 @@ for profile, examples, repeatable in (("thousand", 1000, True), ("explore", 2000
 hypothesis.settings.load_profile("repeatable")
 
 
-# Linux gives a process 65530 memory maps, and a compiled run of a filter takes 400 of them: a
-# worker that keeps every program it compiled crashes in the compiler, and two workers with all
-# their programs leave no room for the processes of the bench.
+# A program of JAX keeps 1.4 MiB of memory, however small, and Linux gives a process 65530 memory
+# maps, of which a compiled run of a filter takes 400: a worker that keeps every program it compiled
+# fills the memory or crashes in the compiler. It forgets them all when it has grown by this much
+# since it last did; the cache gives back those needed again.
+MANY_BYTES = 2**29
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
-# Since programs were last forgotten: what stays then is not freed by forgetting again, and a worker
-# that does so at every test compiles everything anew.
-MANY_BYTES = 2**30
+M_MMAP_THRESHOLD = -3  # of malloc.h
 LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
 FINISHED = pytest.StashKey[int]()
 LEFT = pytest.StashKey[int]()
@@ -105,12 +105,21 @@ def resident() -> int:
     return int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
+def forget(config: pytest.Config) -> None:
+    """Forget all compiled programs and what helpers of tests computed once."""
+    jax.clear_caches()
+    for name in ("memory", "scanned"):
+        if module := sys.modules.get(f"robins.program.{name}"):
+            module._known.clear()
+    gc.collect()
+    if MAPS.exists():
+        ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
+        config.stash[LEFT] = resident()
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
-    """Forget what a file computed once, after it, and compiled programs when there are many.
-
-    The cache gives back those needed again.
-    """
+    """Forget what a file computed once, after it, and compiled programs when there are many."""
     if nextitem is None or nextitem.module is not item.module:
         for kept in vars(item.module).values():
             # those of a helper are for several files
@@ -119,17 +128,15 @@ def pytest_runtest_teardown(item, nextitem):
     if not MAPS.exists():
         return
     count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
-    large = resident() > item.config.stash.setdefault(LEFT, resident()) + MANY_BYTES
+    large = resident() > item.config.stash[LEFT] + MANY_BYTES
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
-        jax.clear_caches()
-        if memory := sys.modules.get("robins.program.memory"):
-            memory._known.clear()
-        gc.collect()
-        ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
-        item.config.stash[LEFT] = resident()
+        forget(item.config)
 
 
 def pytest_configure(config):
+    if MAPS.exists():
+        # Else the allocator keeps ever larger arrays between those that live on.
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 2**20)
     config.pluginmanager.register(meter.Meter(), "meter")
     if hasattr(config, "workerinput"):
         return
@@ -144,12 +151,12 @@ def pytest_collection_modifyitems(config, items):
     config.hook.pytest_deselected(items=others)
 
 
-def pytest_collection_finish():
+def pytest_collection_finish(session):
     """Freeze all imports: the collector of garbage need not look through them again.
 
     Tracing makes many objects that live on, so it is not to look after every 700 either.
     """
-    gc.collect()
+    forget(session.config)
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
