@@ -321,7 +321,9 @@ def page(cells: dict, alarms: list, errors: dict, sound: int) -> str:
     names = list(dict.fromkeys(fault for fault, _ in cells))
     everyone = list(dict.fromkeys(family for _, family in cells))
     lines = [
-        "# Faults by families of filters",
+        "# Filters under faults: which family notices",
+        "",
+        "Faults of the test bench are on [its page](bench.md#faults).",
         "",
         "Made by `python docs/studies/fault_table.py`. What `doubts` tests, its limits and the "
         "set-up of the families were chosen on other seeds (`--development`). A position with",

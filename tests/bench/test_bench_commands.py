@@ -22,7 +22,7 @@ def test_a_run_that_fails_before_its_first_step_is_a_result(tmp_path, monkeypatc
             return b""
 
     on_threads(monkeypatch, counter=Mute)
-    monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
+    monkeypatch.setattr("robins.bench.run.session.FIRST_HELLO_S", 0.2)
     out = tmp_path / "out"
     assert main(["bench", "up", CLOCKWORK, "--out", str(out), "--json"]) == 1
     told = json.loads(capsys.readouterr().out)

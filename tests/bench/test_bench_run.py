@@ -415,7 +415,7 @@ def test_what_does_not_fit_is_refused_before_anything_starts():
 
 
 def test_a_board_that_says_nothing_is_named(monkeypatch, threads):
-    monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
+    monkeypatch.setattr("robins.bench.run.session.FIRST_HELLO_S", 0.2)
     with cable() as ends:
         of = flight(ports={"gyro": ends.bench})
         result = Session(of, config=config("satellite/s1", "mekf", *LOOP)).run()

@@ -236,7 +236,7 @@ def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
     short = {"again_ns": 50_000_000, "most_ns": 200_000_000}
     monkeypatch.setattr(Broker, "step", lambda *args: step(*args, **short))
     monkeypatch.setattr(Threads, "idle_s", lambda part_processes, part: 0.0 if works else math.inf)
-    for name in ("session.HELLO_S", "session._LONG_S"):
+    for name in ("session.FIRST_HELLO_S", "session._LONG_S"):
         monkeypatch.setattr(f"robins.bench.run.{name}", 0.2 if works else 1.0)
     monkeypatch.setattr("robins.bench.broker.broker._REPORT_S", 0.1)
     on_threads(monkeypatch, counter=Slow)

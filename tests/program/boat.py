@@ -57,7 +57,7 @@ def made():
     steps = [(function, run.row(0)[name]) for name, function in functions.items()]
     programs = trace_steps([*steps, (anew, (belief,))], start)
     told = [
-        ("predict", ("input",), "Moves on by one step."),
+        ("predict", ("input",), "Propagates the state by one step."),
         (UPDATE, ("reading", "about"), "Uses a reading."),
         ("reset", ("belief",), "Begins again."),
     ]

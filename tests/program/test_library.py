@@ -11,6 +11,7 @@ from boat import STEPS, made, write_boat
 from exported import found, spoil
 
 from robins.export.library import Library, fields_of, identifier, number, symbol
+from robins.filters import Code
 from robins.program import DOUBLE, SINGLE, to_c, trace
 
 PRECISIONS = {"double": DOUBLE, "float": SINGLE}
@@ -114,6 +115,20 @@ def test_names_that_a_header_cannot_use_end_with_an_underscore():
     assert symbol("update_steering compass") == "update_steering_compass"
     library = Library("boat", made()[0], made()[1], ("From a*/b.",))
     assert library.header().count("*/") == library.header().count("/*")
+
+
+def test_a_note_on_a_field_that_is_not_there_is_refused():
+    entries, start, _ = made()
+    absent = Library("boat", entries, start, (), {("update_log_reading", "value"): "m/s"})
+    assert absent.header() == Library("boat", entries, start).header()  # not every model has a log
+    stale = absent._replace(notes={("state", "mean_rat"): "rad/s"})
+    with pytest.raises(ValueError, match=r"'state' does not have: \['mean_rat'\]"):
+        stale.header()
+
+
+def test_the_codes_are_those_of_the_filters(folder):
+    text = (folder / "boat.h").read_text()
+    assert re.findall(r"BOAT_CODE_(\w+) = (\d+)", text) == [(c.name, str(int(c))) for c in Code]
 
 
 def test_a_library_that_single_precision_ruins_fails(tmp_path):

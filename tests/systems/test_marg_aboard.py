@@ -7,7 +7,13 @@ import pytest
 from interpreted import run
 from scipy.spatial.transform import Rotation
 
+from robins.export.field_notes import field_notes, tangent_axes
+from robins.export.library import EntryPoint, Library
+from robins.export.runs import entry_functions
 from robins.filters import Code
+from robins.program.kinds import kind_of
+from robins.program.nodes import Graph
+from robins.program.walk import Leaf, Program
 from robins.systems.marg import MargReplay, filter_of, model, model_of, prepare
 from robins.systems.marg.aboard import (
     COUNTED_S,
@@ -51,6 +57,49 @@ def test_it_is_the_filter_of_a_replay(ran):
     ):
         size = np.max(np.abs(want))
         np.testing.assert_allclose(got, want, rtol=0.0, atol=1e-10 * max(size, 1e-9))
+
+
+@pytest.mark.parametrize("use", ["undisturbed", "always", "never"])
+def test_its_comments_are_on_fields_that_it_has(use):
+    parameters = PARAMETERS.model_copy(update={"use_magnetometer": use})
+    problem = export_problem(parameters, 0)
+    library = library_of(problem, problem.contenders["marg"])
+    sensors = {entry.name for entry in library.entries}
+    assert ("update_magnetometer" in sensors) == (use != "never")
+    library.header()  # refuses a note on a field that is not there
+    for name, fields, _ in library.structs():
+        for f in fields:
+            noted = (name, f.name) in library.notes or f.name in ("factor", "code")
+            assert noted, f"{name}.{f.name} has no comment"
+
+
+def library_of(problem, contender):
+    """A library whose programs have arguments and results only, by their shapes."""
+    case = problem.simulate(jnp.asarray(0))
+    filter_, model_ = contender.filter, contender.model
+    state = jax.tree.map(jnp.asarray, filter_.init(case.start, model_.dims))
+    rows = jax.tree.map(lambda a: jnp.asarray(a)[0], (case.u, dict(case.y), dict(case.aux)))
+    given = {"predict": (rows[0],)}
+    given |= {f"update_{s}": (y, rows[2].get(s)) for s, y in rows[1].items()}
+    entries = []
+    functions = entry_functions(filter_, model_, given)
+    for name, function in functions.items():
+        made = jax.eval_shape(function, state, *given[name])
+        takes = ("input",) if name == "predict" else ("reading", "about")
+        program = Program(Graph(), leaves((state, *given[name])), [], leaves(made), ((), ()))
+        entries.append(EntryPoint(name, program, takes, ""))
+    axes = tangent_axes(problem, contender.reported, len(state.belief.factor))
+    notes = field_notes(problem, axes, state, given, filter_.suspects)
+    del notes["reset_belief", "factor"]  # there is no reset here
+    return Library("hand", entries, state, (), notes)
+
+
+def leaves(tree):
+    found = jax.tree_util.tree_flatten_with_path(tree)[0]
+    paths = (f"arguments{jax.tree_util.keystr(path)}" for path, _ in found)
+    return [
+        Leaf(x.shape, x.dtype, kind_of(x.dtype), p) for p, (_, x) in zip(paths, found, strict=True)
+    ]
 
 
 def test_its_samples_are_of_its_truth():

@@ -7,11 +7,11 @@ import numpy as np
 import xarray as xr
 
 from robins.earth import Geodetic
-from robins.export.field_notes import components, field_notes, tangent_axes
+from robins.export.field_notes import attitude_lines, components, field_notes, tangent_axes
 from robins.filters import Belief, FilterState
 from robins.ins.extended_pose import ExtendedPose
 from robins.manifold import Angle
-from robins.rotation import Rotation
+from robins.rotation import BodyRotation, Rotation
 from robins.systems.study import Problem, SensorAxes, StateBlock
 
 
@@ -64,6 +64,21 @@ def test_the_mean_has_units_and_axes_in_its_own_order():
         "  4 to 6: position [m], ENU: north, east, minus up",
         "  the others: what the model adds to them",
     ]
+
+
+def test_a_quaternion_has_its_convention_and_the_side_of_its_error():
+    turned, phi = Rotation.identity(), jnp.array([0.1, -0.2, 0.3])
+    convention, side = attitude_lines(MEAN)
+    assert "Hamilton, scalar first; q_nb maps coordinates in b (body)" in convention
+    assert "true = exp(phi x) estimate" in side
+    start = Rotation.from_rotvec(jnp.array([0.5, 0.5, 0.0]))
+    after, turn = start.retract(phi).as_dcm(), Rotation.from_rotvec(phi).as_dcm()
+    np.testing.assert_allclose(after, turn @ start.as_dcm(), atol=1e-14)
+    assert "true = estimate exp(phi x)" in attitude_lines(BodyRotation(turned.wxyz))[1]
+    body = BodyRotation(start.wxyz).retract(phi).as_dcm()
+    np.testing.assert_allclose(body, start.as_dcm() @ turn, atol=1e-14)
+    assert len(attitude_lines(ExtendedPose.identity("left"))) == 1  # its error is that of all
+    assert attitude_lines({"rate": jnp.zeros(3)}) == []
 
 
 def test_what_an_element_holds_is_in_its_own_units():

@@ -83,7 +83,7 @@ _NODE = option(
     multiple=True,
     callback=of_value(_ports),
     metavar="PART=PORT",
-    help="Or =PROGRAM.",
+    help="Put a board (PATH,BAUD) or a program in the place of PART.",
 )
 _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with.")
 
@@ -98,12 +98,22 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with
 @option("--on-death", type=click.Choice(["fail", "restart"]), help="If a part dies.")
 @option("--restarts", type=click.IntRange(1, 100_000), help="Upper limit. [default: 10]")
 @_NODE
-@option("--baud", type=click.IntRange(300), help="Speed of the virtual lines.")
+@option(
+    "--baud",
+    type=click.IntRange(300),
+    help="Speed of the virtual lines; of a board: --node PART=PATH,BAUD.",
+)
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")
 @option("--live", is_flag=True, help="Serve a page that shows the run.")
 @option("--paused", is_flag=True, help="With --live: wait for Start on the page.")
 @option("--host", default="127.0.0.1", show_default=True, help="Page address.")
-@option("--port", type=click.IntRange(0, 65535), default=8321, show_default=True, help="Page port.")
+@option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8321,
+    show_default=True,
+    help="TCP port of the page.",
+)
 @SETTINGS
 @_SEED
 @TRUST

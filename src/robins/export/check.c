@@ -45,6 +45,7 @@ $calls
     if (!good) {
         printf("first in %s\n", where);
     }
+    printf("state: %lu bytes\n", (unsigned long)sizeof(${name}_state));
     printf("bits of all numbers: %08lx%08lx\n", (unsigned long)(bits >> 32),
            (unsigned long)(bits & 0xffffffffu));
     if (sizeof RUINED > 1) {

@@ -1,5 +1,5 @@
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
-# make stack   lists the stack of each function (gcc, clang)
+# make stack   lists the stack of each function by itself (gcc, clang): add up the call chain
 CC ?= cc
 CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic -Wdouble-promotion
 

@@ -15,9 +15,19 @@ from robins.export.library import identifier, symbol
 from robins.export.runs import Arguments
 from robins.filters import Belief
 from robins.manifold import State
+from robins.rotation import BodyRotation, Rotation
 from robins.systems.study import Problem, SensorAxes
 
 MEAN = ".belief.mean"  # of a state
+_SIDES = {
+    Rotation: "exp(phi x) estimate, phi in the axes that it maps to",
+    BodyRotation: "estimate exp(phi x), phi in the axes that it maps from",
+}
+_OUTPUTS = {
+    "nis": "normalised innovation squared",
+    "dof": "number of components used",
+    "used": "1 where used",
+}
 Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
@@ -63,6 +73,18 @@ def components(axes: list[Axis | None]) -> list[str]:
     return lines
 
 
+def attitude_lines(mean: State) -> list[str]:
+    """Comment on the quaternions of a mean: their convention, and the side of their error."""
+    leaves = jax.tree_util.tree_leaves(mean, is_leaf=lambda part: isinstance(part, Rotation))
+    if not any(isinstance(leaf, Rotation) for leaf in leaves):
+        return []
+    elements = jax.tree_util.tree_leaves(mean, is_leaf=manifold.is_element)
+    sides = {_SIDES[type(element)] for element in elements if type(element) in _SIDES}
+    maps = "q_nb maps coordinates in b (body) to coordinates in n"
+    errors = [f"Error phi of an attitude: true = {side}." for side in sides]
+    return [f"Quaternions: Hamilton, scalar first; {maps}.", *(errors if len(errors) == 1 else [])]
+
+
 def field_notes(
     problem: Problem,
     axes: list[Axis | None],
@@ -95,6 +117,7 @@ def field_notes(
             notes[f"{name}_result", "innovation"] = _read(sensor, 0, len(sensor.axes))
             deviation = f"{sensor.units}: its standard deviation; NaN where not used"
             notes[f"{name}_result", "sigma"] = deviation
+            notes |= {(f"{name}_result", field): text for field, text in _OUTPUTS.items()}
             if suspects:
                 notes[f"{name}_result", "wrong"] = (
                     f"probability of being wrong: {', '.join(suspects)}"

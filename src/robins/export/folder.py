@@ -17,7 +17,14 @@ import numpy as np
 
 from robins import __version__
 from robins.campaign.monte_carlo import reported_rows
-from robins.export.field_notes import MEAN, components, field_notes, tangent_axes, tangent_fields
+from robins.export.field_notes import (
+    MEAN,
+    attitude_lines,
+    components,
+    field_notes,
+    tangent_axes,
+    tangent_fields,
+)
 from robins.export.harness import Key, RecordedSteps, check_c, makefile, recorded_h
 from robins.export.library import EntryPoint, Library, symbol
 from robins.export.page import page
@@ -128,6 +135,7 @@ def _library(
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
         *(["Single precision: README.md states the cost."] if single else []),
+        *attitude_lines(belief.mean),
         *components(axes),
     )
     library = library._replace(about=about)
@@ -145,7 +153,7 @@ def _library(
 def _entry(name: str, program: Program) -> EntryPoint:
     """Entry point with the sentence that describes it."""
     if name == "predict":
-        return EntryPoint(name, program, ("input",), "Moves on by one step.")
+        return EntryPoint(name, program, ("input",), "Propagates the state by one step.")
     if name == RESET:
         return EntryPoint(
             name, program, ("belief",), "Starts again from a belief, all else as by init."

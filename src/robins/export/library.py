@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from robins.filters import Code
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
 from robins.program.walk import Leaf, Program, lengths, slots
@@ -33,6 +34,7 @@ RESERVED = frozenset(template("reserved.txt").split())
 
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
 CODE = "code"  # of a result: what the entry point returns
+_ARGUMENTS = {"reading": "Measurement of", "about": "Accompanying data of"}
 
 
 class EntryPoint(NamedTuple):
@@ -142,8 +144,9 @@ class Library(NamedTuple):
         for entry in self.entries:
             for k, name in enumerate(entry.takes):
                 if fields := fields_of(entry.program.inputs, k + 1):
-                    yield self.argument(entry, name), fields, f"What {entry.name} takes."
-            yield f"{entry.symbol}_result", self.result(entry), f"What {entry.name} tells."
+                    of = f"{_ARGUMENTS.get(name, 'Input of')} {entry.name.removeprefix('update_')}."
+                    yield self.argument(entry, name), fields, of
+            yield f"{entry.symbol}_result", self.result(entry), f"Output of {entry.name}."
 
     def argument(self, entry: EntryPoint, name: str) -> str:
         """The name of the struct of an argument."""
@@ -166,12 +169,20 @@ class Library(NamedTuple):
         return f"int {self.name}_{entry.symbol}({', '.join(all_)})"
 
     def header(self) -> str:
-        """The header: types, structs, entry points."""
+        """The header: types, structs, entry points.
+
+        Raises:
+            ValueError: a note is on a field that its struct does not have. Notes on a struct that
+                the library does not have are left out: not every filter has every sensor.
+        """
         guard = f"{self.name.upper()}_H"
         lines = [*self._head(), f"#ifndef {guard}", f"#define {guard}", "", "#include <stdint.h>"]
         lines += ["", part("finite.h"), EXTERN_C[0], ""]
-        lines += [f"typedef {self.precision.kind} {self.name}_real;", ""]
+        lines += [f"typedef {self.precision.kind} {self.name}_real;", "", *self._codes()]
         for name, fields, about in self.structs():
+            unknown = {f for struct, f in self.notes if struct == name} - {f.name for f in fields}
+            if unknown:
+                raise ValueError(f"notes on fields that '{name}' does not have: {sorted(unknown)}")
             lines += [f"/* {about} */", "typedef struct {"]
             for f in fields:
                 kind = f"{self.name}_real" if f.is_real else C_TYPES[f.leaf.kind]
@@ -187,6 +198,13 @@ class Library(NamedTuple):
         for entry in self.entries:
             lines += ["", f"/* {entry.about} Returns its code. */", f"{self.signature(entry)};"]
         return _text([*lines, "", EXTERN_C[1], "", "#endif", ""])
+
+    def _codes(self) -> list[str]:
+        """Result codes as an enumeration."""
+        codes = [f"    {self.name.upper()}_CODE_{code.name} = {int(code)}," for code in Code]
+        codes[-1] = codes[-1].rstrip(",")
+        about = "Result codes: int64_t in an output, int where returned, of equal value."
+        return [f"/* {about} */", "enum {", *codes, "};", ""]
 
     def _head(self) -> list[str]:
         about = (f" * {_within(line)}".rstrip() for line in self.about)

@@ -238,7 +238,7 @@ def cost(
     doubles: Sequence[Made],
     singles: Sequence[Made],
 ) -> PrecisionCost:
-    """Cost of single precision in some runs."""
+    """Compare single with double precision over the given runs."""
     fields: dict[str, float] = {}
     for (wide, _), (narrow, _) in zip(doubles, singles, strict=True):
         for name, part in differences(library.state, wide, narrow).items():

@@ -72,7 +72,7 @@ def taken_by(equations: Sequence[Equation]) -> list[Variable]:
 
 
 def made_by(equations: Sequence[Equation], wanted: Callable[[Variable], bool]) -> list[Variable]:
-    """The variables that equations make for others."""
+    """Outputs of the equations that are used elsewhere."""
     return [v for e in equations for v in e.outvars if wanted(v)]
 
 

@@ -59,7 +59,7 @@ class Interpreter:
         return scan, self.width
 
     def steps(self, tape: Tape) -> Callable[[], Step]:
-        """Steps of a tape; each has registers of its own."""
+        """Factory of step functions for a tape, each with its own registers."""
 
         def step() -> Step:
             registers = self.registers(tape)

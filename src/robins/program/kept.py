@@ -125,7 +125,9 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
 def cached_by_name(
     what: str, key: Hashable, write: Callable[[], Program], interpreter: Interpreter
 ) -> tuple[Program, Tape]:
-    """A program and its tape; from the cache if the key has a text (`names.by_name`), else made.
+    """A program and its tape, from the cache or made.
+
+    They are kept if the key can be written as text (`names.by_name`).
 
     Args:
         what: the kind of the program.

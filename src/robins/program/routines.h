@@ -214,7 +214,8 @@ static inline void product(int m, int depth, int n, const real *a, const real *b
     }
 }
 
-/* Lower Cholesky factor of a symmetric matrix; all NaN where a pivot is not positive. */
+/* Lower Cholesky factor of a symmetric matrix; all NaN where a pivot is not positive. The order of
+   operations is that of the same factor written out as scalars. */
 static inline void cholesky(int n, const real *in, real *out)
 {
     flag positive = FLAG(1);

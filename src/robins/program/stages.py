@@ -396,7 +396,7 @@ class StagedFunction:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons why parts stay with JAX; all are known after the first call."""
+        """Errors that explain which parts could not be compiled; complete after the first call."""
         arrays = (one for one in self._stages if isinstance(one, ArraySteps))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]

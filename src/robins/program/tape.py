@@ -301,7 +301,7 @@ class Writer:
         return found
 
     def _scopes(self) -> list[int]:
-        """The loop in which each instruction lies."""
+        """Innermost loop of each instruction."""
         found = [0] * len(self.written)
         for s, (begin, end) in sorted(self.spans.items()):  # a later scope lies further in
             found[begin:end] = [s] * (end - begin)

@@ -114,7 +114,7 @@ def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
 
 
 def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
-    """Lengths of the arrays of C for reals and for all other numbers: one at least."""
+    """Lengths of the two C arrays (reals, others), at least 1 each."""
     reals, others = counts(leaves)
     return max(reals, 1), max(others, 1)
 

@@ -48,7 +48,9 @@ def export_filter(
     name: Scenario,
     to: Annotated[Path, Option("A new folder.", "--to", "DIR")],
     *,
-    filter_name: Annotated[str, Option("Which. [default: the system's]", "--filter", "NAME")] = "",
+    filter_name: Annotated[
+        str, Option("Which. [default: the system's, else the scenario's first]", "--filter", "NAME")
+    ] = "",
     fast: Annotated[bool, Option("Keep loops, or write them out.", "--small/--fast")] = False,
     float32: Annotated[bool, Option("Single precision, and what it costs.")] = False,
     board: Annotated[bool, Option("Build it as a part of the bench too.")] = False,
@@ -92,7 +94,7 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     rig = _rig_for(name) if board else None
-    asked = _exportable(_requested(rig, float32, name, filter_name, seed, settings), adjust)
+    asked = _exportable(_request_for_rig(rig, float32, name, filter_name, seed, settings), adjust)
     precision = SINGLE if float32 else DOUBLE
     texts, library, found = files_of(asked, None if fast else SMALL, precision)
     files = {**texts, **(firmware(rig.wire) if rig else {}), **asked.files}
@@ -136,12 +138,12 @@ def _built(folder: Path, part: str) -> Path:
     return folder / f"{part}_board"
 
 
-def _requested(
+def _request_for_rig(
     rig: Rig | None, float32: bool, name: str, filter_name: str, seed: int, settings: Sequence[str]
 ) -> Request:
     """Request for the filter as a part of a rig in this scenario; else as in a simulation."""
     if rig is None or rig.aboard is None:
-        return _export_request(name, filter_name, seed, settings)
+        return _request_for_scenario(name, filter_name, seed, settings)
     if float32:
         what = f"the {rig.name} is not navigated in single precision"
         raise InputError(what, "--float32", "leave it out with --board")
@@ -162,7 +164,9 @@ def _exportable(asked: Request, adjust: Sequence[str]) -> Request:
         return with_adjustable(asked, adjust)
 
 
-def _export_request(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:
+def _request_for_scenario(
+    name: str, filter_name: str, seed: int, settings: Sequence[str]
+) -> Request:
     """Request for a filter, with the problem by which it is tested."""
     system, label, text = find_scenario(name, recorded=True)
     if system.aboard is not None and system.replay_parameters is not None:

@@ -26,6 +26,8 @@ Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, each with its
 _REMEMBERED = 64  # steps for which repeated messages are recognised
 _REPORT_S = 10.0  # period of reports on the parts that are waited for
 _POLL_S = 0.05  # period of polling everything but the lines while nothing comes
+ANSWER_NS = 30_000_000_000  # time-out for the answer to a tick, where there is no other
+REPEAT_TICK_NS = 1_000_000_000  # time after which an unanswered tick is sent again
 _CLOCK_NS = time.monotonic_ns
 
 
@@ -155,8 +157,8 @@ class Broker:
         self,
         number: int,
         patience_ns: int | None = None,
-        again_ns: int = 1_000_000_000,
-        most_ns: int = 30_000_000_000,
+        again_ns: int = REPEAT_TICK_NS,
+        most_ns: int = ANSWER_NS,
     ) -> None:
         """Execute one step of all parts.
 

@@ -245,11 +245,11 @@ class Link:
         if name != "hello" and (name != "done" or frame.header.run != self._run):
             self.count("strange")
             if frame.header.run == self._run:
-                self._in_sequence(frame, now_ns)  # it has come, and is not lost
+                self._check_sequence(frame, now_ns)  # it has come, and is not lost
         elif not self._refuses(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
             if name == "done":
-                self._in_sequence(frame, now_ns)
+                self._check_sequence(frame, now_ns)
             found.append((name, frame))
 
     def _refuses(self, name: str, frame: Frame, now_ns: int) -> bool:
@@ -257,12 +257,12 @@ class Link:
         if (why := self._wire.unsound(name, frame.payload)) is None:
             return False
         if name != "hello":  # whose number is not of this run
-            self._in_sequence(frame, now_ns)
+            self._check_sequence(frame, now_ns)
         self.count("refused")
         self._refuse(self.name, name, why)
         return True
 
-    def _in_sequence(self, frame: Frame, now_ns: int) -> bool:
+    def _check_sequence(self, frame: Frame, now_ns: int) -> bool:
         """Count the sequence number of a frame; true if the frame is new and in order."""
         here = now_ns if frame.header.time_ns == now_ns else None
         most = self._sequence.REMEMBERED + self._most_lost
@@ -279,7 +279,7 @@ class Link:
 
     def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
         name = self._wire.names.get(frame.header.type)
-        new = self._in_sequence(frame, now_ns)
+        new = self._check_sequence(frame, now_ns)
         if name is None:
             self.count("strange")
         elif new:

@@ -1,8 +1,8 @@
 """The live page: a running bench in a browser, from a process of its own.
 
 - `LivePage`: the handle of the bench; starts the server, feeds it, takes its commands, never waits.
-- `signals`: signals and plots of the page.
-- `feed`: data between the bench and the server.
+- `feed`: signals of the page, and data between the bench and the server.
+- `events`, `history`: events and samples of the run so far.
 - `hub`, `commands`, `guard`, `server`: the server; they need the extra "live".
 - `static`: the page; no build step, uPlot with its licence.
 """

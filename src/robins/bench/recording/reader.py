@@ -29,7 +29,7 @@ _DIRECTIONS: dict[str, Literal["to", "from"]] = {"to": "to", "from": "from"}
 
 
 class Record(NamedTuple):
-    """Contents of a record."""
+    """A record that was read: header, entries, events, and whether it is complete."""
 
     header: dict[str, Any]
     entries: Sequence[layout.Entry] | Entries  # in the order in which they were written

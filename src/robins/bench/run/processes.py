@@ -80,7 +80,7 @@ class PartProcesses:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end()
+        self.end_all()
         self._held.close()
 
     def start(self, part: str, port: str, since: int = -1) -> None:
@@ -141,7 +141,7 @@ class PartProcesses:
         if part in self._running:
             self._running[part].kill()
 
-    def end(self) -> None:
+    def end_all(self) -> None:
         """End all: processes that received a stop end by themselves, the others are killed."""
         until = time.monotonic() + _GRACE_S
         while any(p.poll() is None for p in self._running.values()):

@@ -34,8 +34,8 @@ from robins.bench.run.telemetry import Telemetry, require_truth
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import PayloadFault
 
-HELLO_S = 120.0  # time-out for the hello of a part that does not compute
-REVIVED_S = 60.0
+FIRST_HELLO_S = 120.0  # time-out for the first hello of a part that does not compute
+RESTART_S = 60.0  # time-out for the hello and each answer of a part that is restarted
 _RESTART_HINT = '; on_death = "restart" would restart it'
 _LONG_S = 9.0  # wait for a hello that is reported as an event
 _TELL_S = 0.2  # period of progress reports
@@ -152,7 +152,7 @@ class Session:
             self._broker = self._wire(stack)
             began = time.monotonic()
             try:
-                self.broker.gather(self.run_number, HELLO_S)
+                self.broker.gather(self.run_number, FIRST_HELLO_S)
                 began = time.monotonic()
                 done = self._go()
                 counted = slice(counted_from(self.flight, done), done)
@@ -336,10 +336,10 @@ class Session:
             self._catch_up,
             self._histories,
             self.part_processes.idle_s,
-            self._waiting,
+            self._report_waiting,
         )
 
-    def _waiting(self, parts: Sequence[str], since_s: float) -> None:
+    def _report_waiting(self, parts: Sequence[str], since_s: float) -> None:
         """Report the parts whose hello is missing."""
         processes = [part for part in parts if part not in self.ports]
         silent = [part for part in parts if part in self.ports]
@@ -465,7 +465,7 @@ class Session:
             since = self._histories[part].since
             self.part_processes.start(part, self._speaks[part], since)
             try:
-                self.broker.revive(part, REVIVED_S, partial(self._require_alive, part))
+                self.broker.revive(part, RESTART_S, partial(self._require_alive, part))
             except ProcessExit as again:
                 death, by_itself = again, True
                 continue

@@ -13,7 +13,7 @@ from robins.bench.broker.broker import Broker
 from robins.bench.broker.injector import Injector
 from robins.bench.run.processes import PartProcesses
 
-HELLO_S = 60.0  # for the hello of a part that is switched on
+POWER_ON_HELLO_S = 60.0  # for the hello of a part that is switched on
 
 
 def switch(
@@ -56,5 +56,5 @@ def switch(
         broker.switch_off(part)
         part_processes.start(part, speaks[part])
     for part in sorted(broker.off - off):
-        broker.switch_on(part, HELLO_S)
+        broker.switch_on(part, POWER_ON_HELLO_S)
         event("power", f"'{part}' is switched on, and begins anew")

@@ -6,6 +6,7 @@ Little endian; the check goes over all before it (Castagnoli's polynomial, as iS
 (Cheshire & Baker 1999) takes every zero out for one byte in 254, so a zero is always the edge of a
 frame. There is one at *both* ends: after noise the opening zero ends the noise, and a frame that
 lost its closing zero ends at the next one's opening, so damage to one frame never costs another.
+The same in C: `firmware/robins_wire.h.in`.
 """
 
 from __future__ import annotations

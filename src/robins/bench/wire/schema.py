@@ -1,8 +1,9 @@
 """All messages on the lines of a rig, in one table: encoded, checked, documented, put into C.
 
 The messages of the protocol are those of every rig; a rig adds its parts and its data. Numbers are
-part of the protocol: add at the end, never renumber, never reuse. A change of the fields of a
-message makes a new version of the table.
+part of the protocol: add at the end, never renumber, never reuse. Any change of this table, its
+wording included, changes its number, `Wire.number`: boards must be rebuilt, and records made before
+cannot be replayed, only read. `VERSION` is that of the framing.
 """
 
 from __future__ import annotations

@@ -83,7 +83,10 @@ def _cholesky(walk: JaxprWriter, equation: Equation, P: Nodes) -> list[Nodes]:
 
 
 def _cholesky_of(walk: JaxprWriter, P: Nodes) -> tuple[Nodes, ...]:
-    """Lower factor by rows; all NaN where a pivot is not positive, as JAX returns it."""
+    """Lower factor by rows; all NaN where a pivot is not positive, as JAX returns it.
+
+    The same in C, for large matrices: `cholesky` in `program/routines.h`.
+    """
     n, apply = len(P), walk.graph.apply
     if walk.stays_whole(n**3 // 3):
         return tuple(call(walk, "cholesky", [n], [P], [(n, n)]))

@@ -80,10 +80,10 @@ def _select_n(walk: JaxprWriter, equation: Equation, which: Nodes, *cases: Nodes
     if len(cases) == 2 and equation.invars[0].aval.dtype == np.bool_:
         return walk.select(which, cases[1], cases[0])
 
-    def among(index: Node, *nodes: Node) -> Node:
+    def pick_case(index: Node, *nodes: Node) -> Node:
         return graph.pick(nodes, index)
 
-    return walk.each(among, which, *cases)
+    return walk.each(pick_case, which, *cases)
 
 
 @rule("convert_element_type")

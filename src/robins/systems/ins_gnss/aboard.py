@@ -86,7 +86,7 @@ def export_sources(
     wide = not hasattr(chosen.case(world).start.mean, "q_nb")
     macros = {
         "MEAN(field)": f"mean_{'ins_' if wide else ''}##field",
-        "TELL_WRONG(result, to)": _wrong_to_wire(chosen.filter.suspects, suspects),
+        "REPORT_WRONG(result, to)": _wrong_to_wire(chosen.filter.suspects, suspects),
     }
     return problem, _given_h(given, rates_hz, world, macros)
 

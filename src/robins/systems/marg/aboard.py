@@ -51,26 +51,29 @@ FIELDS = {
     ("predict_input", "still"): "1 where the unit lies still, else 0",
     ("predict_input", "lost_turn"): "rad, body: spread of the turn that was not sampled, else 0",
     ("predict_input", "lost_dv"): "m/s: spread of the velocity that was not sampled, else 0",
-    ("update_travel_reading", "value"): "zeros; NaN where nothing is claimed, as at rest",
+    ("update_travel_reading", "value"): "zeros: velocity and place stay near zero; NaN where "
+    "nothing is claimed, as at rest",
     ("update_rest_reading", "value"): "zeros at rest, else NaN",
-    ("update_rest_about", "value"): "rad/s, body: mean rate read at rest; its sigma",
-    ("update_magnetometer_reading", "at_0_rad"): "0 to use the field, else NaN",
-    ("update_magnetometer_reading", "at_1"): "likewise",
+    ("update_rest_about", "value"): "0 to 2: rad/s, body: mean rate read at rest; 3: rad/s, sigma",
+    ("update_magnetometer_reading", "at_0_rad"): "0: use the azimuth of the field given in "
+    "`about`; NaN: do not",
+    ("update_magnetometer_reading", "at_1"): "the same for its horizontal strength and its "
+    "vertical component",
     ("update_magnetometer_about", "value"): "T, body at the end of the step: calibrated field",
     ("update_revisit_reading", "rad"): "0 where a site is read, else NaN",
-    ("update_revisit_about", "value"): "T, body: mean field; rad, sigma of its azimuth; 1 for the "
-    "site",
-    **{("state", f"memory_1_rest_{k}"): text for k, text in _GATE.items()},
-    **{("state", f"memory_3_magnetometer_{k}"): text for k, text in _GATE.items()},
-    ("state", "memory_3_magnetometer_residual"): "innovations of the last ones",
-    ("state", "memory_3_magnetometer_known"): "which of them are there",
-    **{
-        ("state", f"memory_{k}_{name}_{of}"): text
-        for k, name in (("0_0", "travel"), ("2_0", "magnetometer"))
-        for of, text in _LEARNED.items()
-    },
+    ("update_revisit_about", "value"): "0 to 2: T, body: mean field; 3: rad, sigma of its azimuth; "
+    "4 to 7: 1 for the site, 0 for the others",
+    **{("state", f"memory_0_0_travel_{k}"): text for k, text in _LEARNED.items()},
+    **{("state", f"memory_2_rest_{k}"): text for k, text in _GATE.items()},
 }
 """Comments on the fields of the exported library, in addition to those of the model."""
+FIELDS_OF_GATE = {
+    **{("state", f"memory_3_0_magnetometer_{k}"): text for k, text in _LEARNED.items()},
+    **{("state", f"memory_4_magnetometer_{k}"): text for k, text in _GATE.items()},
+    ("state", "memory_4_magnetometer_residual"): "innovations of the last ones",
+    ("state", "memory_4_magnetometer_known"): "which of them are there",
+}
+"""The same of a filter that refuses a disturbed field."""
 
 
 class BoardInput(NamedTuple):
@@ -186,5 +189,5 @@ def export_problem(parameters: MargReplay, seed: int) -> Problem:
         contenders={CAUSAL: Contender(one_prior(parameters), known)},
         claims=lambda metrics: [],
         count_from=int(np.searchsorted(end_s, COUNTED_S - 1e-9)),
-        fields=FIELDS,
+        fields=FIELDS | (FIELDS_OF_GATE if parameters.use_magnetometer == "undisturbed" else {}),
     )

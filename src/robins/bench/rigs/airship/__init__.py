@@ -64,7 +64,7 @@ def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 
-_SAID = {
+_DEVICE_FAULTS = {
     "shifted": DeviceFault("radar", "fix", "sensed", _shifted, ("shift",)),
     "blind": DeviceFault("star", "attitude", "blind", nothing),
     "stuck": DeviceFault("air", "wind", "repeated"),
@@ -104,7 +104,7 @@ class AirshipRig(Rig):
 
     def device_faults(self) -> DeviceFaults:
         """Faults of radar, star sensor and air data."""
-        return _SAID, {"shift": (_SHIFT, default("200 m"))}
+        return _DEVICE_FAULTS, {"shift": (_SHIFT, default("200 m"))}
 
 
 RIG = AirshipRig()

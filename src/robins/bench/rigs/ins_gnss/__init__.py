@@ -76,12 +76,12 @@ def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
 
 
 def _blind(values: Values, *_: Any) -> Values:
-    """Outage: a stamp without numbers."""
+    """GNSS outage: time stamp only, all values NaN, quality 0."""
     nothing = np.full(3, np.nan)
     return {**values, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
 
 
-_SAID = {
+_DEVICE_FAULTS = {
     "shifted": DeviceFault("gnss", "fix", "sensed", _shifted, ("shift",)),
     "stuck": DeviceFault("gnss", "fix", "repeated"),
     "blind": DeviceFault("gnss", "fix", "blind", _blind),
@@ -108,7 +108,7 @@ class InsGnssRig(Rig):
     aboard = later(f"{code}:aboard")
 
     def flies(self) -> dict[str, Path]:
-        """Simulated drives."""
+        """Simulated drive, and a recorded walk."""
         drive = named("robins.systems.ins_gnss:SYSTEM").scenarios["drive"]
         return {"ins-gnss/drive": drive, "ins-gnss/walk": drive.with_name("walk.toml")}
 
@@ -123,7 +123,7 @@ class InsGnssRig(Rig):
 
     def device_faults(self) -> DeviceFaults:
         """Faults of the receiver."""
-        return _SAID, {"shift": (_SHIFT, default("30 m"))}
+        return _DEVICE_FAULTS, {"shift": (_SHIFT, default("30 m"))}
 
 
 RIG = InsGnssRig()

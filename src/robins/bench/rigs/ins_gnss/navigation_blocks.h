@@ -11,7 +11,7 @@
 #include "filter.h"
 #include "navigation_given.h"
 
-#define HAIR_S 1e-9 /* times that are nearer are one */
+#define TIME_TOLERANCE_S 1e-9 /* times that are nearer are one */
 #define USUAL (PIECES - 8) /* pieces that a block has room for in a replay */
 
 typedef struct {
@@ -117,7 +117,7 @@ static inline void predict(filter_state *x, double from_s, double to_s, int know
     double share = fmin((end_s - begin_s) / s->dt, 1.0);
     double before = fmin(fmax((begin_s - (s->end_s - s->dt)) / s->dt, 0.0), 1.0);
     from_s = end_s;
-    if (end_s - begin_s <= HAIR_S) continue;
+    if (end_s - begin_s <= TIME_TOLERANCE_S) continue;
     if (share > 1.0 - 1e-6) share = 1.0, before = 0.0;
     if (n == PIECES) { /* stamps in bursts: the block is taken in two */
       filter_predict(x, &block, &moved);
@@ -155,7 +155,7 @@ static inline void rate_about(double at_s, double *rate) {
 /* What a velocity that is a mean over a window is older by, as robins.ins.blocks has it. */
 static inline void gained_before(double at_s, double window_s, double *gained_b, double *age_s) {
   int last = 0, k;
-  while (last + 1 < count && steps[last].end_s < at_s - HAIR_S) last++;
+  while (last + 1 < count && steps[last].end_s < at_s - TIME_TOLERANCE_S) last++;
   for (k = last; k > 0 && steps[k - 1].end_s > at_s - window_s;) k--;
   gained_b[0] = gained_b[1] = gained_b[2] = *age_s = 0.0;
   for (; window_s > 0.0 && k <= last; k++) { /* each turns what was gained before it */

@@ -9,7 +9,7 @@
 #include "navigation_start.h"
 
 #define AHEAD_S 10.0 /* of the newest sample, by which a fix may be */
-#define TOLD 256 /* epochs that wait to be told: one is told a step */
+#define MOST_WAITING 256 /* epochs that wait to be told: one is told a step */
 
 enum { STARTING = 1, REFUSED = 2 }; /* of the state */
 
@@ -22,7 +22,7 @@ static uint64_t sample_ns, fix_ns;
 static int64_t last_ns, elsewhere_ns; /* stamps: of the last sample; of those that do not follow it */
 static int opened, elsewhere;
 static epoch past[PAST];
-static robins_epoch told[TOLD];
+static robins_epoch told[MOST_WAITING];
 static int kept, waiting; /* of past (0: not begun), told */
 
 static robins_state state; /* what was answered */
@@ -61,7 +61,7 @@ static void step(double to_s, double wanted_s, int number) {
   predict(&now->state, now->time_s, to_s, count, 1);
   now->time_s = to_s, now->wanted_s = wanted_s, now->number = number, kept++;
   for (int k = 0; k < heard; k++) {
-    if (fabs(fixes[k].time_s - to_s) >= HAIR_S) continue;
+    if (fabs(fixes[k].time_s - to_s) >= TIME_TOLERANCE_S) continue;
     place.lat = fixes[k].place[0], place.lon = fixes[k].place[1], place.alt = fixes[k].place[2];
     memcpy(about.sigma, fixes[k].sigma_m, sizeof about.sigma);
     memcpy(v_n, fixes[k].v_n, sizeof v_n);
@@ -70,37 +70,37 @@ static void step(double to_s, double wanted_s, int number) {
   }
   rate_about(to_s, about.omega_b);
   filter_update_gnss_position(&now->state, &place, &about, &seen);
-  TELL_WRONG(seen, now->wrong);
+  REPORT_WRONG(seen, now->wrong);
 #if VELOCITIES
   filter_update_gnss_velocity_reading velocity;
   filter_update_gnss_velocity_about fresh;
-  filter_update_gnss_velocity_result felt;
+  filter_update_gnss_velocity_result velocity_result;
   int some = isfinite(v_n[0]) || isfinite(v_n[1]) || isfinite(v_n[2]);
   memcpy(velocity.value, v_n, sizeof v_n);
   memcpy(fresh.sigma, sigma_v, sizeof sigma_v);
   memcpy(fresh.omega_b, about.omega_b, sizeof fresh.omega_b);
   gained_before(to_s, some ? WINDOW_S : 0.0, fresh.gained_b, &fresh.age_s);
-  filter_update_gnss_velocity(&now->state, &velocity, &fresh, &felt);
-  TELL_WRONG(felt, now->wrong);
+  filter_update_gnss_velocity(&now->state, &velocity, &fresh, &velocity_result);
+  REPORT_WRONG(velocity_result, now->wrong);
 #endif
 #if REST
-  filter_update_zero_velocity_reading stands;
-  filter_update_zero_velocity_result stood;
+  filter_update_zero_velocity_reading zero_velocity_reading;
+  filter_update_zero_velocity_result zero_velocity_result;
   filter_update_zero_rate_reading turns;
   filter_update_zero_rate_result turned;
   double mean[6];
   int last = 0;
-  while (last + 1 < count && steps[last].end_s < to_s - HAIR_S) last++;
+  while (last + 1 < count && steps[last].end_s < to_s - TIME_TOLERANCE_S) last++;
   int still = rests(last, mean);
   for (int i = 0; i < 3; i++) {
-    stands.value[i] = still ? 0.0 : NAN;
+    zero_velocity_reading.value[i] = still ? 0.0 : NAN;
     turns.value[i] = still ? mean[i] : NAN;
   }
-  filter_update_zero_velocity(&now->state, &stands, &stood);
+  filter_update_zero_velocity(&now->state, &zero_velocity_reading, &zero_velocity_result);
   filter_update_zero_rate(&now->state, &turns, &turned);
-  TELL_WRONG(turned, now->wrong);
+  REPORT_WRONG(turned, now->wrong);
 #endif
-  if (waiting < TOLD) tell(&now->state, now->wrong, llrint(to_s * 1e9) + origin_ns, &told[waiting++]);
+  if (waiting < MOST_WAITING) tell(&now->state, now->wrong, llrint(to_s * 1e9) + origin_ns, &told[waiting++]);
   int old = 0, gone = 0; /* one epoch before the longest delay is where a fix is counted from */
   while (past[old].time_s < to_s - DELAY_S) old++;
   if (old > 1) memmove(past, past + old - 1, sizeof *past * (size_t)(kept -= old - 1));
@@ -212,9 +212,9 @@ static int take_fix(void) {
   double speed = hypot(one.v_n[0], one.v_n[1]);
   if (isfinite(speed)) one.moves = speed > fmax(MOVING_SPEED, 4.0 * fmax(spread[0], spread[1]));
   if (!(time_s > 0.0) || time_s > newest_s + AHEAD_S) return REFUSED;
-  if (kept && time_s <= past[0].time_s + HAIR_S) return REFUSED; /* too old */
+  if (kept && time_s <= past[0].time_s + TIME_TOLERANCE_S) return REFUSED; /* too old */
   for (int k = 0; k < heard; k++) {
-    if (fabs(fixes[k].time_s - time_s) < HAIR_S) return REFUSED;
+    if (fabs(fixes[k].time_s - time_s) < TIME_TOLERANCE_S) return REFUSED;
   }
   if (!any && !kept) return REFUSED; /* later a fix without a number is an epoch */
   if (heard == FIXES) memmove(fixes, fixes + 1, sizeof *fixes * (size_t)(at = --heard));

@@ -56,7 +56,7 @@ static inline int rests(int at, double *mean) {
   double least = calmest, end_s = steps[at].end_s;
   int still = looks_still(at, mean);
   const row *last = NULL;
-  for (int k = 0; k < heard && fixes[k].time_s <= end_s + HAIR_S; k++) {
+  for (int k = 0; k < heard && fixes[k].time_s <= end_s + TIME_TOLERANCE_S; k++) {
     if (fixes[k].moves < 0) continue;
     if (last && fixes[k].moves) least = fmin(least, last->calm);
     last = &fixes[k];

@@ -69,7 +69,7 @@ def _hidden(said: Values, fault: LinkFault, _: int) -> Values:
     return said
 
 
-_SAID: dict[str, DeviceFault] = {
+_DEVICE_FAULTS: dict[str, DeviceFault] = {
     "dark": DeviceFault("sky", "stars", "blind", nothing),
     "hidden": DeviceFault("sky", "stars", "said", _hidden, ("stars",)),
 }
@@ -102,7 +102,7 @@ class LaboratoryRig(SatelliteRig):
     def device_faults(self) -> DeviceFaults:
         """Faults of the satellite and of the star simulator."""
         kinds, parameters = super().device_faults()
-        return {**kinds, **_SAID}, {**parameters, "stars": (_STARS, 1)}
+        return {**kinds, **_DEVICE_FAULTS}, {**parameters, "stars": (_STARS, 1)}
 
     def view(self) -> PageView:
         """Page of the satellite, with the faults of the star simulator."""

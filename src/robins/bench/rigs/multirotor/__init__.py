@@ -75,7 +75,7 @@ def _motor(values: Values, fault: LinkFault, _: int) -> Values:
     return {**values, "control": values["control"] * share}
 
 
-_SAID = {
+_DEVICE_FAULTS = {
     "magnet": DeviceFault("imu", "sample", "sensed", _magnet, ("field",)),
     "blind": DeviceFault("gnss", "fix", "blind", nothing),
     "motor": DeviceFault("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
@@ -126,7 +126,7 @@ class MultirotorRig(Rig):
 
     def device_faults(self) -> DeviceFaults:
         """Faults of compass, receiver and motors."""
-        return _SAID, _FAULTS
+        return _DEVICE_FAULTS, _FAULTS
 
     def once(self, setup: Setup, part: str) -> str:
         """Reason why an external autopilot cannot be replayed: its state is in no record."""

@@ -37,6 +37,7 @@ void open_line(const char *path) {
   mode.c_iflag = mode.c_oflag = mode.c_lflag = 0;
   mode.c_cflag = CS8 | CREAD | CLOCAL;
   mode.c_cc[VMIN] = mode.c_cc[VTIME] = 0;
+  /* The speed must be that of `--node`, here 460800. */
   cfsetispeed(&mode, B115200);
   cfsetospeed(&mode, B115200);
 #ifdef B460800
