@@ -33,7 +33,7 @@ class RobinsError(Exception):
 
     def __str__(self) -> str:
         sentence = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{sentence}; {self.fix}" if self.fix else sentence
+        return f"{sentence.removesuffix('.')}; {self.fix}" if self.fix else sentence
 
 
 _NOTHING = object()

@@ -73,7 +73,7 @@ def test_scripts_get_the_summary(robins):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--filters", "ekg"), "no filter 'ekg' in car; did you mean 'ekf'?"),
+        (("--filters", "ekg"), "car.toml; did you mean 'ekf'?"),
         (("--without", "sonar"), "no sensor 'sonar'; this model has ['gnss_position', "),
         (("--at", "10"), "unit"),
         (("--at", "1 h"), "3600 s is not within the run, 1 s to "),

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -73,6 +74,28 @@ MISTAKES = {
     "step of another structure": (
         runs(step=lambda x, u: (x[:1], x[1:])),
         "step of the motion returns ('float64(1,)', 'float64(1,)') of a state float64(2,)",
+    ),
+    "step that returns a list": (
+        runs(step=lambda x, u: [x[0], x[1]]),
+        "returns ['float64()', 'float64()'] of a state float64(2,): return jnp.array([...])",
+    ),
+    "mean that is a list": (
+        lambda: Belief.of([0.0, 1], np.eye(2)),
+        "initial mean is a list of numbers: give an array, jnp.array([0.0, 1])",
+    ),
+    "mean that is a tuple": (
+        lambda: Belief.of((0.0,), np.eye(1)),
+        "give an array, jnp.array([0.0])",
+    ),
+    "a sensor for sensors": (
+        lambda: Model.__post_init__(
+            SimpleNamespace(sensors=Sensor(F.dot, jnp.ones(2), name="ranger"))
+        ),
+        "sensors must be a tuple of sensors, as in (ranger,), got the Sensor 'ranger'",
+    ),
+    "noise of a wrong size": (
+        lambda: Motion(lambda x, u: x, jnp.ones(3)).noise_factor(jnp.zeros(2), None),
+        "noise of the motion has shape (3,): (2,) standard deviations or a (2, k) factor",
     ),
     "step of another element": (
         runs(start=Belief.of(Angle(jnp.zeros(())), np.eye(1)), step=lambda x, u: x.rad),

@@ -56,6 +56,9 @@ def test_readings_may_be_elements_of_a_manifold():
     assert np.abs(y["turned"].rad).min() > 2.5
 
 
+READS_BOTH = rb.Model(model().motion, (rb.Sensor(lambda x, aux: x, jnp.ones(1), name="a"),))
+
+
 class Wind(rb.Scenario):
     gust: Annotated[float, Quantity("length", least="0 m")] = default("2 m")
 
@@ -82,6 +85,12 @@ def test_model_and_faults_may_be_functions():
     [
         ({"states": {"height": "m"}}, "states names height; the error has 2 components"),
         ({"readings": {"b": "m"}}, "readings names b; the model has a"),
+        (
+            {"states": {"place": "metre", "speed": "m/s"}},
+            r"states\['place'\]: unknown unit 'metre'",
+        ),
+        ({"readings": {"a": "metres"}}, r"readings\['a'\]: unknown unit .*; write one of the SI"),
+        ({"model": READS_BOTH}, r"sensor 'a' reads 2 numbers, and its noise .* is of 1"),
         ({"filters": {}}, "needs a filter"),
         ({"steps": 0}, "needs a step at least, got 0"),
     ],

@@ -113,12 +113,24 @@ def test_its_filters_and_claims_are_listed(capsys):
     assert "kf, gated" in told
     assert "gate-helps" in told
     assert f"robins run {EXAMPLE}:study" in told
+    assert "default  all of these run" in told
+
+
+def test_an_error_in_a_file_of_the_user_is_named_with_its_line(capsys, tmp_path):
+    text = EXAMPLE.read_text().replace("T = given.step\n", "T = given.steps\n")
+    (tmp_path / "wrong.py").write_text(text)
+    line = 1 + text.splitlines().index("    T = given.steps")
+    assert main(["run", f"{tmp_path / 'wrong.py'}:study", "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "failed: AttributeError" in told
+    assert f"in {tmp_path / 'wrong.py'}, line {line}; run it again with --debug" in told
+    assert "fault of robins" not in told
 
 
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
-        (["--filters", "gatd"], "did you mean 'gated'?"),
+        (["--filters", "gatd"], f"in {EXAMPLE}:study; did you mean 'gated'?"),
         (["--set", 'claims=["gate-help"]'], "did you mean 'gate-helps'?"),
         (["--set", "barometr=1 m"], "barometer"),
         (["--set", "barometer=1 s"], "barometer"),
@@ -139,7 +151,8 @@ def test_a_mistyped_name_is_refused_with_the_nearest(words, wanted, capsys, tmp_
         ("import nothing_of_that_name", "study", "importing it failed: ModuleNotFoundError"),
         ("raise ZeroDivisionError('here')", "study", "ZeroDivisionError: here"),
         (EXAMPLE.read_text(), "studi", "did you mean 'study'?"),
-        (EXAMPLE.read_text(), "", "wrong.py:study"),
+        (EXAMPLE.read_text(), "", "no study is named; write one of wrong.py:study"),
+        (EXAMPLE.read_text(), "none", "no study 'none' in it; write one of"),
         (EXAMPLE.read_text(), "FILTERS", "it is of type dict"),
     ],
 )

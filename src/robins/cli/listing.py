@@ -45,11 +45,12 @@ def _details(system: Mapping[str, Any], summary: str, titles: Mapping[str, str])
     """Scenarios, filters and claims of a system."""
     first = next(iter(system["scenarios"]), None)
     next_ = f"run {first}" if first else f"replay LOG --system {system['name']}"
+    default = system["default"] or ("all of these run" if first == system["name"] else "none")
     return "\n".join(
         [
             f"{_section(system['name'], summary, titles)}\n",
             f"filters  {', '.join(system['filters'])}",
-            f"default  {system['default'] or 'none'}",
+            f"default  {default}",
             f"logs     {'yes, with `robins replay`' if system['replays'] else 'no'}",
             *(f"claim    {claim['id']}: {claim['text']}" for claim in system["claims"]),
             f"\nNext:   robins {next_}",

@@ -17,6 +17,7 @@ from robins.cli import interrupts
 from robins.cli.commands import app
 from robins.cli.frame import ExitStatus
 from robins.errors import RobinsError
+from robins.systems import trust
 
 _OF_A_PATH = {  # faults of a given path, not of the disk
     *(errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
@@ -160,7 +161,9 @@ def _described(error: Exception) -> tuple[str, ExitStatus]:
     else:
         first = (str(error).strip().splitlines() or [""])[0]
         text = f"failed: {type(error).__name__}: {first}\n"
-        text += "this may be a fault of robins; run it again with --debug to see where."
+        own = trust.place(error)
+        text += f"in {own}; " if own else "this may be a fault of robins; "
+        text += "run it again with --debug to see where."
     return text, ExitStatus.BAD_INPUT if bad_input else ExitStatus.FAILED
 
 

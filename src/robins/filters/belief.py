@@ -35,10 +35,15 @@ class Belief(NamedTuple):
         """Belief from a mean and a covariance; it checks both, so it cannot run inside `jit`.
 
         Raises:
-            TypeError: the mean holds something that is not a real number.
+            TypeError: the mean holds something that is not a real number, or is a list or tuple of
+                plain numbers: JAX takes each of these for a part of the state, not of an array.
             ValueError: the mean is not finite, or the covariance is not positive semidefinite or
                 has the wrong size.
         """
+        plain = [isinstance(leaf, float | int) for leaf in manifold.leaves(mean)]
+        if type(mean) in (list, tuple) and plain and all(plain):
+            given = f"a {type(mean).__name__} of numbers"
+            raise TypeError(f"initial mean is {given}: give an array, jnp.array({list(mean)})")
         mean = jax.tree_util.tree_map(
             lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
         )

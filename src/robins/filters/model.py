@@ -32,7 +32,7 @@ def as_noise(value: Data, n: int, whose: str) -> Array:
     noise = jnp.asarray(value, float)
     if noise.ndim not in (1, 2) or noise.shape[0] != n:
         raise ValueError(
-            f"noise of {whose} has shape {noise.shape}: ({n},) standard deviations or an ({n}, k) "
+            f"noise of {whose} has shape {noise.shape}: ({n},) standard deviations or a ({n}, k) "
             "factor L of the covariance L L' are wanted"
         )
     return linalg.as_factor(noise)
@@ -106,7 +106,11 @@ class Motion:
         """State after a step; refuse any dtype but float64, and types or shapes other than x's."""
         new = _in_float64("step of the motion", self.step(x, u))
         if (found := _kinds(new)) != (wanted := _kinds(x)):
-            raise ValueError(f"step of the motion returns {found} of a state {wanted}")
+            parts = isinstance(new, list | tuple) and not any(
+                map(jnp.shape, jax.tree_util.tree_leaves(new))
+            )
+            fix = ": return jnp.array([...])" if parts and isinstance(x, jax.Array) else ""
+            raise ValueError(f"step of the motion returns {found} of a state {wanted}{fix}")
         return new
 
     def noise_factor(self, x: State, u: Data) -> Array:
@@ -171,6 +175,11 @@ class Model:
     sensors: tuple[Sensor, ...]
 
     def __post_init__(self):
+        if isinstance(self.sensors, Sensor):
+            one = self.sensors.name
+            raise TypeError(
+                f"sensors must be a tuple of sensors, as in ({one},), got the Sensor '{one}'"
+            )
         names = [s.name for s in self.sensors]
         require(len(set(names)) >= len(names), "sensors must have names of their own", names)
 

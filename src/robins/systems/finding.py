@@ -8,7 +8,6 @@ modules of its folder; `robins.systems.trust` decides which files may run.
 from __future__ import annotations
 
 import os
-import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -62,7 +61,7 @@ def _of_file(name: str, folder: Path, named_in: str | os.PathLike[str]) -> Syste
         )
     if wanted not in vars(module):
         raise UnknownSystem(
-            f"no study '{wanted}' in it{hint(wanted, offered)}",
+            f"no study '{wanted}' in it{hint(wanted, offered)}" if wanted else "no study is named",
             path,
             f"write one of {', '.join(f'{where}:{key}' for key in offered)}",
         )
@@ -90,9 +89,7 @@ def _place(path: Path, error: Exception) -> str:
     """File and line of an error: of the syntax error, or of the last call in this file."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == path:
         return f"{path}, line {error.lineno}"
-    frames = traceback.extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path]
-    return f"{path}, line {lines[-1]}" if lines else str(path)
+    return trust.place(error, [path]) or str(path)
 
 
 def as_system(name: str, found: Any, where: str) -> System:

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from robins import manifold
+from robins import manifold, units
 from robins.errors import require
 from robins.filters import Belief, Filter, Model, Sensor
 from robins.manifold import State
@@ -67,7 +67,7 @@ def study_from_model(
 
     Raises:
         ValueError: there is no step, or no filter; raised when runs are laid out: states or
-            readings are named that the model does not have.
+            readings are named that the model does not have, or `check` finds what does not fit.
     """
     require(steps > 0, "a study needs a step at least", steps)
     require(filters, "a study needs a filter at least")
@@ -75,6 +75,7 @@ def study_from_model(
     def lay_out(given: ParametersT) -> Believed:
         made = model if isinstance(model, Model) else model(given)
         belief = start if isinstance(start, Belief) else start(given)
+        check(made, belief, states or {}, readings or {})
         return made, belief
 
     def simulate(given: ParametersT, course: Believed, seed: int, run: Array) -> Case:
@@ -92,6 +93,48 @@ def study_from_model(
 
     chosen: Any = Scenario if parameters is None else parameters
     return Study(chosen, tuple(filters), simulate, contender, view, lay_out, claims or {})
+
+
+def check(
+    model: Model, start: Belief, states: Mapping[str, str], readings: Mapping[str, str]
+) -> None:
+    """Refuse sizes that do not fit (`tried`) and unknown units, before anything is drawn.
+
+    Raises:
+        ValueError: as `tried` and `require_units` raise it.
+    """
+    jax.eval_shape(partial(tried, model), start.mean)
+    require_units("states", states)
+    require_units("readings", readings)
+
+
+def tried(model: Model, x: State) -> None:
+    """Take one step from x, and read each sensor there, to find what does not fit.
+
+    Raises:
+        ValueError: a step, a reading or a noise does not have the size that it should have.
+    """
+    model.motion.moved(x, None)
+    model.motion.noise_factor(x, None)
+    for sensor in model.sensors:
+        name, size = sensor.name, manifold.dim(sensor.reading(x, None))
+        told = f"sensor '{name}' reads {size} numbers, and its noise (or dim=) is of {sensor.dim}"
+        require(size == sensor.dim, told)
+        sensor.noise_factor(x, None)
+
+
+def require_units(of: str, named: Mapping[str, str]) -> None:
+    """Refuse an unknown unit, by the name whose unit it is.
+
+    Raises:
+        UnitError: a unit is not one of `robins.units.UNITS`.
+    """
+    for name, symbol in named.items():
+        try:
+            units.unit(symbol)
+        except units.UnitError as error:
+            fix = "write one of the SI such as 'm', 'm/s' or 'rad', or '1' for none"
+            raise units.UnitError(error.what, f"{of}[{name!r}]", fix) from None
 
 
 def drawn(

@@ -18,6 +18,7 @@ import os
 import shlex
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterable, Iterator
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
 from importlib.util import spec_from_file_location
@@ -201,6 +202,22 @@ def load(path: Path) -> ModuleType:
             )
     _local.update(found)
     return importlib.import_module(path.stem)
+
+
+def place(error: BaseException, files: Iterable[Path] = ()) -> str:
+    """File and line of the last call of an error in certain files; "" if it has none in them.
+
+    Args:
+        error: as caught.
+        files: resolved; those loaded in this process where none is given.
+    """
+    files = set(files) or {file for file, _ in _local.values()}
+    calls = [
+        f"{path}, line {frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if (path := Path(frame.filename).resolve()) in files
+    ]
+    return calls[-1] if calls else ""
 
 
 def _spec(

@@ -59,7 +59,7 @@ def bound(
     _float64.require()
     one = read_scenario(name, (*settings, f"runs={runs}"))
     wanted = filter_name or one.own[0]
-    chosen = check_filters(one.label, one.study.filters, [wanted])
+    chosen = check_filters(one.source, one.study.filters, [wanted])
     times = [units.parse(time, "time") for time in at]
     progress(0.0, "linearising along the truth")
     with refusing(name):

@@ -91,7 +91,7 @@ def plan_campaign(
     store = open_store(where)
     one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
     text = scenario.text_of(scenario.override(scenario.mapping_of(one.text), settings))
-    chosen = check_filters(one.label, one.study.filters, filters or with_default_filter(one))
+    chosen = check_filters(one.source, one.study.filters, filters or with_default_filter(one))
     wanted: int = one.parameters.runs
     before = read(store)
     if before is None:

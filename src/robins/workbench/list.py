@@ -62,7 +62,7 @@ def _system_entry(name: str) -> dict[str, Any]:
 
     system = find_system(name)
     return {
-        "name": system.name,
+        "name": name,
         "summary": catalogue.summaries().get(name, ""),
         "scenarios": [name] if catalogue.is_file(name) else list(titles(name)),
         "filters": list(system.filters),

@@ -64,7 +64,7 @@ def run(
     _float64.require()
     check_machine(machine)
     one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
-    chosen = check_filters(one.label, one.study.filters, filters or with_default_filter(one))
+    chosen = check_filters(one.source, one.study.filters, filters or with_default_filter(one))
     progress(0.0, "setting up the simulation")
     problem = one.problem(chosen, seed)
     if not filters:  # the default was not there when the claims were stated

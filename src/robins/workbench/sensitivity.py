@@ -122,7 +122,7 @@ def sensitivity(
     every = _checked(vary, samples)
     read = read_scenario(name, settings)
     wanted = filter_name or read.own[0]
-    check_filters(read.label, read.study.filters, [wanted])
+    check_filters(read.source, read.study.filters, [wanted])
     progress(0.0, "setting up the simulation")
     budget = _budget(name, read, wanted, every, settings, seed)
     points = sobol_points(len(every), samples, seed)

@@ -123,7 +123,7 @@ def on_runs(
     """
     read = read_scenario(name, settings)
     wanted = filter_name or read.own[0]
-    (chosen,) = check_filters(read.label, read.study.filters, [wanted])
+    (chosen,) = check_filters(read.source, read.study.filters, [wanted])
     tuned = varied(vary, read.parameters, scenario.text_of(overridden(read.text, settings)))
     problem = read.problem((chosen,), seed)
     names = [b.name for b in problem.blocks]

@@ -59,7 +59,7 @@ def _of_file(path: Path, wanted: str) -> Rig:
     if not isinstance(found := getattr(module, wanted, None), Rig):
         offered = [key for key, value in vars(module).items() if isinstance(value, Rig)]
         raise UnknownRig(
-            f"no rig '{wanted}' in it{hint(wanted, offered)}",
+            f"no rig '{wanted}' in it{hint(wanted, offered)}" if wanted else "no rig is named",
             path,
             "assign a robins.bench.Rig to a name at its top level",
         )
