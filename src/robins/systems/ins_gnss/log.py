@@ -37,6 +37,7 @@ from robins.systems.ins_gnss.reported import (
     DIVERGED,
     antenna_of,
     distances,
+    fitting_sigma,
     fix_arrays,
     sigma_notes,
     verdict,
@@ -459,7 +460,8 @@ def replay(
     outcome.warnings[:0] = doubts
     files = as_files(log.time_s, origin_ns, pieces, answers) if parameters.every_sample else {}
     word = verdict(answers, outcome.metrics, outcome.warnings)
-    return replace(outcome, verdict=word, files=files)
+    setting = fitting_sigma(dataset, parameters, outcome.metrics)
+    return replace(outcome, verdict=word, files=files, setting=setting)
 
 
 def _estimates(mean: InsState) -> Mapping[str, Numbers]:
