@@ -453,6 +453,7 @@ def replay(
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + notes * any(name.startswith(ROBUST) for name in wanted)
         + sigma_notes(dataset, parameters)
+        + ["Distances are to the fixes, which err too: a better path may lie farther from them."]
         + found
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=origin_ns,
