@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.patches import Patch
 
 from robins.report import bounds, series, style
 from robins.report.numbers import words
@@ -312,8 +311,8 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     dots = {"color": style.GREY, "linestyle": ":", "linewidth": 0.8}
     if stated is not None and few and runs:
-        tint = "95\u00a0% of the RMS if σ is true"
-        more.append(Patch(color=style.GREY, alpha=0.15, linewidth=0, label=tint))
+        tint = {"color": style.GREY, "alpha": 0.15, "linewidth": 8.0}
+        more += [style.key("95\u00a0% of the RMS if σ is true", **tint)]
     more += [style.key("|mean error|", **dots)] if mean is not None else []
     more += [bounds.key()] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))
