@@ -125,10 +125,14 @@ def test_sentences_name_the_longest_times_and_tables_leave_gaps():
         "bank finds gnss position wrong: 10.0 to 12.0 s, 30.0 to 31.0 s, 50.0 to 51.0 s, "
         "70.0 to 71.0 s and 1 shorter times; probability up to 0.90."
     )
-    assert sentences("bank", time, {"imu": 0.1 * chance}) == [
-        "bank finds none of these wrong: imu."
-    ]
+    assert sentences("bank", time, {"imu": 0.1 * chance}) == ["bank finds nothing wrong with imu."]
     assert sentences("ekf", time, {}) == []
+    falling = {"imu": np.where(time < 9, 0.8 - 0.02 * time, 0.1)}  # what the bank began with
+    assert sentences("bank", time, falling) == ["bank finds nothing wrong with imu."]
+    falling["imu"][5] = 0.85
+    assert sentences("bank", time, falling) == [
+        "bank suspects imu: 0.0 to 8.0 s; probability up to 0.85."
+    ]
     assert spans(time, chance > 0.5)[:2] == [(3.0, 3.0), (10.0, 12.0)]
     table = tables("wrong", [{}, {"imu": chance}, {"gyro": chance}])["wrong"]
     assert table.shape == (3, 100, 2)

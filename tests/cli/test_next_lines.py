@@ -72,6 +72,14 @@ def test_of_a_log_that_begins_in_motion_it_navigates(robins, tmp_path):
     assert float(found[1]) == pytest.approx(36.87, abs=5.0)
     assert "that of the kind is assumed" in out
     assert "[gnss] sigma" in told
+    (line,) = [one for one in out.splitlines() if one.startswith("Next:")]
+    assert line.endswith("   fixes scatter by less than assumed")
+    command, *words = shlex.split(line.removeprefix("Next:").rsplit("   ", 1)[0])
+    assert command == "robins"
+    status, out, _ = robins(*words)
+    assert status == 0
+    assert "north, east, down, from gnss.sigma." in out
+    assert "--export csv   writes the estimates as a table" in out
 
 
 def test_what_the_doctor_writes_is_in_the_line(robins, tmp_path):

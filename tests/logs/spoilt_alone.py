@@ -120,7 +120,10 @@ LIMITS = {"absurd": [(imu(accel=put((50, 1), 1e308)), "warning line 52: accel is
 
 COLUMNS = {
     "column_missing": [(imu(gyro=put((ALL, 2), np.nan)), "error", N, "no_samples")],
-    "not_finite": [(imu(gyro=put(([10, 20], 2), [np.nan, np.inf])), "warning line 12", 2)],
+    "not_finite": [
+        (imu(gyro=put(([10, 20], 2), [np.nan, np.inf])), "warning line 12", 2),
+        (imu(gyro=put((slice(10, None), 2), np.nan)), "error line 12: More than half of the log"),
+    ],
     "axis_stuck": [
         (imu(gyro=put((ALL, 1), 0.0)), "error: gyro_y is 0 in every sample", 0.0),
         (imu(gyro=put((ALL, 1), 0.37)), "error: gyro_y is 0.37 in", 0.37, "gyro_unit"),

@@ -24,13 +24,14 @@ def test_an_unknown_file_is_refused_with_the_candidates(tmp_path):
     with pytest.raises(LogError) as caught:
         open_log(path)
     text = str(caught.value)
-    first, *rows = text.splitlines()
+    first, *rows, last = text.splitlines()
     assert first == (
         f"{path} line 1: no known format fits ('dear diary'); "
         "give --format, or --columns (`robins guess` writes them); these are known:"
     )
     assert [row.split(maxsplit=1) for row in rows] == [[f.name, f.about] for f in FORMATS]
     assert max(map(len, rows)) < 120
+    assert last == f"Next:   robins guess {path} > notes.toml"
 
 
 def test_decimal_commas_are_told_when_no_format_fits(tmp_path):

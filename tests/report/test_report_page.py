@@ -128,9 +128,11 @@ def test_hostile_names_are_printed_and_not_obeyed(town):
 
 
 def test_nothing_to_show_is_said(town):
-    nothing = town | {"claims": [], "counts": {}, "filters": {}}
+    nothing = town | {"claims": [], "counts": {}, "filters": {}, "machine": "jax"}
     words = Reader(report.page(nothing, [], ORIGIN)).words
     assert "No claims are attached to this scenario." in words
+    recorded = {key: value for key, value in nothing.items() if key != "machine"}
+    assert "No claims" not in Reader(report.page(recorded, [], ORIGIN)).words
     assert "Every sample was used." in words
     assert "Figures" not in words
 

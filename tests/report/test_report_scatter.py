@@ -47,7 +47,7 @@ def test_median_and_highest_are_lines_and_the_middle_a_tint(run):
         np.testing.assert_allclose((at.min(), at.max()), values[i, 7, [0, 2]])
     low, top = axes.get_ylim()
     assert low <= values.min() < values.max() <= top
-    for words in ("median of 50 runs", "99 %", "from 5 % to 95 %", "to 3.7"):
+    for words in ("median of 50 runs", "and the largest", "from 5 % to 95 %", "to 3.7"):
         assert words in picture.caption
     picture.figure.canvas.draw()
     assert not collisions(picture.figure)

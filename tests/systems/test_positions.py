@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from short_drive import DRIVE
 
 from robins import scenario
@@ -248,11 +249,13 @@ def test_a_verdict_says_whether_a_replay_is_good(nis, refused, apart_m, doubts, 
 
     answers = {"ekf": answer(0.0)} | ({} if apart_m is None else {"ekf+rts": answer(apart_m)})
     key = f"nis_{POSITION}"
-    of = {key: nis, f"{key}_band": [0.9, 1.1], f"refused_{POSITION}": refused}
+    independent = 3 * (40 - refused) // 10
+    band = chi2.ppf([0.025, 0.975], independent) / independent
+    of = {key: nis, f"{key}_band": band.tolist(), f"refused_{POSITION}": refused}
     said = verdict(answers, {"ekf": of, "ekf+rts": {}}, doubts)
     assert said.startswith(begins)
     assert f"{refused} of 40 fixes refused" in said
-    assert ("sigmas from its smoother" in said) == (apart_m is not None)
+    assert ("sigmas away from the smoothed path" in said) == (apart_m is not None)
     assert verdict({"ekf+rts": answer(1.0)}, {"ekf+rts": {}}, []) == ""
 
 

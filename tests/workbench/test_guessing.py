@@ -81,7 +81,7 @@ def test_what_numbers_do_not_tell_is_marked(tmp_path):
     (tmp_path / "b.csv").write_text("t,ax,ay,az,wx,wy,wz\n0,,,,1,2,3\n")  # one row, of the gyros
     assert "accel_x = " in guess(tmp_path / "b.csv")
     sheet(tmp_path / "c.csv", ["a", "b", "c", "d"], [zero, t])
-    with pytest.raises(InputError, match="no headings of a whole table; there are a, b, c, d"):
+    with pytest.raises(InputError, match="no sensor has all its headings; there are a, b, c, d"):
         guess(tmp_path / "c.csv")
     (tmp_path / "d.csv").write_text("1,2,3\n4,5,6\n")
     with pytest.raises(InputError, match="no line of names stands above rows of numbers"):
@@ -89,6 +89,30 @@ def test_what_numbers_do_not_tell_is_marked(tmp_path):
     (tmp_path / "e.db3").write_bytes(b"SQLite format 3\0" + bytes(300))
     with pytest.raises(InputError, match=r"format is known: ROS 2.*no columns are needed"):
         guess(tmp_path / "e.db3")
+
+
+def test_a_clock_and_axes_of_unusual_names_are_found(tmp_path):
+    t, gyro, accel = moved()
+    names = ["w1", "w2", "w3", "a1", "a2", "a3", "compass_1", "compass_2"]
+    columns = [gyro, accel, np.tile([20.0, 5.0], (N, 1))]
+    sheet(tmp_path / "a.csv", ["Zeit (ms)", *names], [1e3 * t, *columns])
+    text = guess(tmp_path / "a.csv")
+    assert 'time = { name = "Zeit (ms)", unit = "ms" }   # GUESSED: it rises' in text
+    assert "GUESSED: 1, 2 and 3 behind a name are x, y and z" in text
+    assert "#   compass_1: not known" in text
+    declared = tomllib.loads(text)["columns"]
+    assert [declared[f"accel_{axis}"]["name"] for axis in "xyz"] == ["a1", "a2", "a3"]
+    sheet(tmp_path / "b.csv", ["Zeit", *names], [t, *columns])
+    assert 'time = { name = "Zeit", unit = "s" }   # GUESSED: 100 rows' in guess(tmp_path / "b.csv")
+    sheet(tmp_path / "c.csv", ["row", *names], [np.arange(N), *columns])
+    assert "NOT KNOWN: no column of time was found" in guess(tmp_path / "c.csv")
+    sheet(tmp_path / "d.csv", ["t", *names[:2], *names[3:6]], [t, gyro[:, :2], accel])
+    with pytest.raises(InputError, match="gyro_x, gyro_y, gyro_z are not found, so no accel is"):
+        guess(tmp_path / "d.csv")
+    axes = ["gx", "gy", "ax", "ay", "az", "mx", "my", "mz"]
+    field = np.tile([20.0, 5.0, 45.0], (N, 1))
+    sheet(tmp_path / "e.csv", ["t", *axes], [t, gyro[:, :2], accel, field])
+    assert "#   gx: gyro_z is not found, so the three are left out" in guess(tmp_path / "e.csv")
 
 
 @pytest.mark.parametrize(

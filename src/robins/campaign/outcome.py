@@ -126,7 +126,7 @@ def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
             )
     if suspects and not remarks:
         listed = ", ".join(map(words, suspects))
-        return [f"{name} finds none of these wrong in any of {s.runs} runs: {listed}."]
+        return [f"{name} finds nothing wrong with {listed} in any of {s.runs} runs."]
     return remarks
 
 

@@ -109,8 +109,12 @@ def _simulated_or_aligned(
 def _guessed(path: Path, as_json: bool) -> None:
     text = importlib.import_module("robins.workbench").guess(path)
     print_data({"toml": text}, text.rstrip("\n"), as_json)
-    words = shlex.join(["robins", "doctor", str(path), "--columns", "columns.toml"])
-    click.echo(f"Next:   save it as columns.toml, check what is GUESSED, then {words}", err=True)
+    name = f"{path.name.split('.')[0] or 'columns'}.toml"
+    words = shlex.join(["robins", "doctor", str(path), "--columns", name])
+    todo = ["fill in the lines marked NOT KNOWN"] * ("NOT KNOWN" in text)
+    todo += ["check what is GUESSED"] * ("GUESSED" in text)
+    click.echo(f"Next:   save it as {name}, {', '.join([*todo, f'then {words}'])}", err=True)
+    click.echo("        give --columns again for each further file of the log", err=True)
 
 
 def _compared(first: Path, second: Path, as_json: bool) -> None:

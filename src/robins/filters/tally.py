@@ -27,6 +27,17 @@ CORRELATED = 10  # degrees of freedom that count as one, since innovations may b
 LEVEL = 0.999  # of the two-sided band of the mean NIS
 
 
+def correlated_band(dof: int, level: float = 0.95) -> np.ndarray:
+    """Band (2,) of the mean NIS of recorded data, in which `CORRELATED` innovations count as one.
+
+    Args:
+        dof: degrees of freedom of all innovations.
+        level: probability of the two-sided band.
+    """
+    count = max(dof // CORRELATED, 1)
+    return chi2_band(count, 1, level) / count
+
+
 class StepWarning(UserWarning):
     """A run has steps that were not taken, or measurements that contradict exact knowledge."""
 
@@ -151,8 +162,7 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
 
 def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     """Sentence on a mean NIS per degree of freedom that is far from one."""
-    count = max(dof // CORRELATED, 1)
-    low, high = chi2_band(count, 1, LEVEL) / count
+    low, high = correlated_band(dof, LEVEL)
     if (cautious or min(low, NIS_LOW) <= ratio) and ratio <= max(high, NIS_HIGH):
         return []
     why = (

@@ -287,9 +287,15 @@ def _missing(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> 
             f"{name} is {column[0]} in every sample. The sensor was not recorded, or the columns "
             "are in another order; without it there is no inertial navigation."
         )
-    return warning(imu, "not_finite", bad, first)(
+    most = bad > 0.5 * len(imu)
+    then = (
+        "More than half of the log is lost: too little is left to navigate"
+        if most
+        else "A replay leaves those samples out and declares the gaps"
+    )
+    return (error if most else warning)(imu, "not_finite", bad, first)(
         f"{name} is {column[first]} here, and not a number in {bad} samples in all. The sensor or "
-        "the logger skipped them; `clean` refuses those samples and declares the gaps."
+        f"the logger skipped them. {then}."
     )
 
 

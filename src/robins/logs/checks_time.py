@@ -37,6 +37,11 @@ _SLOWEST_IMU_S = 0.25
 # Longest and shortest step [s]; a path may be as fast as motion capture.
 _STEPS_S = {ImuTable: (_SLOWEST_IMU_S, 2e-5), GnssTable: (45.0, 5e-3), Trajectory: (45.0, 2e-4)}
 _LONGEST_BATCH_S = 1.5
+_SMALLER = (
+    (1e-3, "milliseconds", "ms"),
+    (1e-6, "microseconds", "us"),
+    (1e-9, "nanoseconds", "ns"),
+)
 _PART = 500  # rows
 _WHY_GAPS = {
     GnssTable: "The receiver had no solution there; the run goes on by inertia alone",
@@ -96,11 +101,12 @@ def _slow(table: Table, usual: float) -> Iterator[Finding]:
 def _unit(table: Table, usual: float) -> Iterator[Finding]:
     """Rate that no such sensor has, which reveals the unit of time."""
     slowest, fastest = _STEPS_S.get(type(table), (2.0, 2e-5))
-    for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+    for factor, unit, symbol in _SMALLER:
         if usual > slowest and fastest < usual * factor < slowest:
             yield error(table, "time_unit", usual)(
                 f"samples are {usual:g} s apart, one every {usual * factor:g} s if the time column "
-                f"is in {unit}. It probably is; convert it to seconds."
+                f"is in {unit}. It probably is; convert it to seconds, or state unit = "
+                f'"{symbol}" in the file of --columns.'
             )
             return
     if usual > slowest or usual < fastest:
@@ -280,8 +286,8 @@ def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
     if overlap <= 0:
         cause = _offset(a, b, c, d)
         yield error(other, "no_overlap", c - a)(
-            f"covers {c:.3f} to {d:.3f} s, {name_of(imu)} covers {a:.3f} to {b:.3f} s: no common "
-            f"time. {cause}"
+            f"covers {_covered(other)}, {name_of(imu)} covers {_covered(imu)}: no common time. "
+            f"{cause}"
         )
         return
     if abs(abs(c - a) - _LEAP) < 1.0 and abs(abs(d - b) - _LEAP) < 1.0 and (c - a) * (d - b) > 0:
@@ -302,6 +308,15 @@ def _span(table: Table) -> tuple[float, float]:
     ns = np.sort(table.time_ns)
     trim = len(ns) // 100
     return float(ns[trim]) * 1e-9, float(ns[len(ns) - 1 - trim]) * 1e-9
+
+
+def _covered(table: Table) -> str:
+    """Start and end in words; "mostly" where a stamp is far from the others."""
+    (a, b), ns = _span(table), table.time_ns
+    low, high = float(np.min(ns)) * 1e-9, float(np.max(ns)) * 1e-9
+    if high - low > 1.1 * (b - a):
+        return f"mostly {a:.3f} to {b:.3f} s"
+    return f"{low:.3f} to {high:.3f} s"
 
 
 def _offset(a: float, b: float, c: float, d: float) -> str:
@@ -329,11 +344,14 @@ def _offset(a: float, b: float, c: float, d: float) -> str:
     ):
         if fits(shift):
             return f"Its times are probably {cause}: they fit if {shift:+.0f} s is added."
-    for scale, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+    for scale, unit, symbol in _SMALLER:
         for low, high, whose in ((c, d, "its"), (a, b, "the IMU's")):
             first, last = (a, b) if whose == "its" else (c, d)
             if min(last, high * scale) - max(first, low * scale) > 0:
-                return f"They fit if {whose} times are {unit}: convert that column to seconds."
+                return (
+                    f"They fit if {whose} times are {unit}: convert that column to seconds, or "
+                    f'state unit = "{symbol}" in the file of --columns.'
+                )
     hours = round((a - c) / 3600.0)
     if 0 < abs(hours) <= 14 and fits(hours * 3600.0):
         return f"They fit if {hours:+d} h is added: one clock is in local time."

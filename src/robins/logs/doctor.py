@@ -132,7 +132,7 @@ ALONE = (
     ),
     _check("In the inertial samples", check_columns, "imu")(
         ("column_missing", "error", "a column without a number"),
-        ("not_finite", "warning", "single samples without a number"),
+        ("not_finite", "warning or error", "samples without a number; an error if most are"),
         ("axis_stuck", "error", "a value that never changes"),
         ("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
         ("saturated", "warning", "the range was too small"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -176,9 +177,12 @@ def recognise(path: AnyPath) -> Format:
     candidates = found or FORMATS
     width = max(len(f.name) for f in candidates)
     listed = "".join(f"\n  {f.name:{width}}  {f.about}" for f in candidates)
+    stem = os.path.basename(head.file).split(".")[0] or "columns"
+    words = f"{shlex.join(['robins', 'guess', head.file])} > {shlex.quote(f'{stem}.toml')}"
+    then = "" if found else f"\nNext:   {words}"
     raise refused(head.file, f"line {shown[0]}")(
         f"{'several formats fit' if found else 'no known format fits'} ({shown[1][:60]!r})",
-        f"{remedy}:{listed}",
+        f"{remedy}:{listed}{then}",
     )
 
 

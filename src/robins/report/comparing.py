@@ -15,6 +15,7 @@ from robins.results import Probability, find
 
 _MOST = 12  # charts of one figure
 _COLUMNS = 3
+_NO_ERRORS = ("nis_", "refused_", "rest_share", "log_likelihood")  # no comparison by themselves
 
 
 def metrics(filters: Mapping[str, Values]) -> dict[str, list[float | int | None]]:
@@ -35,10 +36,10 @@ def _is_number(value: Any) -> bool:
 
 @style.styled
 def comparison(summary: Summary) -> Picture | None:
-    """Bars of every metric the filters share; None if there is nothing to compare."""
+    """Bars of every metric the filters share; None if none is an error."""
     filters = list(summary["filters"])
     found = dict(list(metrics(summary["filters"]).items())[:_MOST])
-    if not found:
+    if all(name.startswith(_NO_ERRORS) for name in found):
         return None
     columns = min(_COLUMNS, len(found))
     rows = -(-len(found) // columns)

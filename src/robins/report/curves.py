@@ -241,6 +241,8 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
     name = words(block)
     caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
     caption += found.attrs.get("comment", "") + found.frame
+    if block == "euler" and series.one(solution, "sigma", "attitude") is not None:
+        caption += " Stated sigmas, about the navigation axes: sigma_attitude of solution.nc."
     title = f"Estimated {name}" if role == "estimate" else name.capitalize()
     return Picture(f"{role}_{block}", title, caption.strip(), figure)
 
@@ -308,6 +310,9 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     dots = {"color": style.GREY, "linestyle": ":", "linewidth": 0.8}
+    if stated is not None and few and runs:
+        tint = {"color": style.GREY, "alpha": 0.15, "linewidth": 8.0}
+        more += [style.key("95\u00a0% of the RMS if σ is true", **tint)]
     more += [style.key("|mean error|", **dots)] if mean is not None else []
     more += [bounds.key()] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))

@@ -59,7 +59,7 @@ def _page(summary: Summary, figures: str, origin: ReportOrigin) -> str:
         title=title,
         css=texts["page.css"],
         meta=" · ".join(meta),
-        verdict=_verdict(summary["claims"], summary.get("verdict", "")),
+        verdict=_verdict(summary),
         warnings=_sentences("warning", summary.get("warnings", ())),
         notes=_sentences("note", origin.notes),
         metrics=_metrics(summary["filters"]),
@@ -70,10 +70,13 @@ def _page(summary: Summary, figures: str, origin: ReportOrigin) -> str:
     )
 
 
-def _verdict(claims: Sequence[Claim], sentence: str) -> str:
-    if sentence:
+def _verdict(summary: Summary) -> str:
+    claims = summary["claims"]
+    if sentence := summary.get("verdict", ""):
         worst = numbers.state_of(sentence)
         return f'<p class="verdict {worst}">{_SIGNS.get(worst, "")} {escape(sentence)}</p>'
+    if not claims and not summary.get("machine"):
+        return ""  # of a recorded log nothing is claimed
     verdicts = {claim["verdict"] for claim in claims}
     worst = next((v for v in ("not", "undecided", "partly", "reproduced") if v in verdicts), "")
     sign = f"{_SIGNS[worst]} " if worst else ""

@@ -32,6 +32,11 @@ Values = Mapping[str, Json]  # metrics of a filter
 Claim = Mapping[str, Json]  # with its verdict
 Summary = Mapping[str, Json]  # contents of `summary.json`
 MARK = " !"  # behind a number outside its own band
+_LABELS = {  # where the words of the name would mislead
+    "aided_horizontal_rms_m": "Distance to the fixes used, horizontal RMS",
+    "aided_vertical_rms_m": "Distance to the fixes used, vertical RMS",
+    "error_over_sigma_bounds": "Interval of error over sigma",
+}
 _STATES = {"Consistent": "reproduced", "With care": "partly", "Do not trust": "not"}
 _WORDS = {"euler": "Euler angles", "accel": "accelerometer"}
 
@@ -49,7 +54,7 @@ class Label(NamedTuple):
 def label(metric: str) -> Label:
     """Words and unit of a metric's name; for a share, the unit at its end is that of its limit."""
     unit = None if "share" in metric.split("_") else _UNIT.search(metric)
-    text = words(metric[: unit.start()] if unit else metric) or metric
+    text = _LABELS.get(metric) or words(metric[: unit.start()] if unit else metric) or metric
     texts = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
     return Label(text[:1].upper() + text[1:], texts)
 

@@ -9,6 +9,8 @@ from robins.report import series, style
 from robins.report.numbers import words
 from robins.report.style import Picture
 
+_WHOLE = 100  # runs below which the highest percentile is the largest of them
+
 
 @style.styled
 def percentiles(solution: xr.Dataset, block: str) -> Picture:
@@ -30,11 +32,15 @@ def percentiles(solution: xr.Dataset, block: str) -> Picture:
             axes.fill_between(data.x / clock.seconds, of[:, low], of[:, high], **tint)
     if np.any(np.isfinite(lengths)):
         style.decades(axes, float(np.nanmin(lengths)), float(np.nanmax(lengths)))
-    more = [style.key(f"{data.axes[highest]} of the runs", color=style.GREY, linewidth=0.7)]
+    runs = int(data.attrs["runs"])
+    few = runs < _WHOLE
+    thin = f"largest of {runs} runs" if few else f"{data.axes[highest]} of the runs"
+    more = [style.key(thin, color=style.GREY, linewidth=0.7)]
     style.legend(figure, [*style.filter_keys(filters), *more])
+    most = "the largest" if few else f"what {data.axes[highest]} of them do not exceed"
     caption = (
-        f"Length of the error over all components: the median of {int(data.attrs['runs'])} runs "
-        f"(line) and what {data.axes[highest]} of them do not exceed (thin)."
+        f"Length of the error over all components: the median of {runs} runs "
+        f"(line) and {most} (thin)."
     )
     if tinted:
         caption += f" Tint: from {data.axes[low]} to {data.axes[high]} of the runs."

@@ -10,17 +10,21 @@ from matplotlib.patches import Patch
 from robins.report import series, style
 from robins.report.style import Picture
 
+_VISIBLE = 0.01  # probability below which a line lies on zero
+
 
 @style.styled
 def suspects(solution: xr.Dataset) -> Picture | None:
-    """Fault probability by suspect over time; None if no filter states one."""
+    """Fault probability by suspect over time; None if there is none above zero."""
     first, mean = (series.get(solution, role) for role in ("wrong", "mean_wrong"))
     true = series.one(solution, "truly_wrong")
     assert first is not None
     names = [name.replace("_", " ") for name in first.axes]
     filters = series.filters(solution)
     stating = [i for i in range(len(filters)) if np.isfinite(first.values[i]).any()]
-    if not stating:
+    shown = [one.values[stating] for one in (first, mean) if one is not None]
+    suspected = any(np.nanmax(values, initial=0.0) > _VISIBLE for values in shown)
+    if not suspected and (true is None or not np.any(true)):
         return None
     figure, stack, clock = series.stacked(solution, first.x, names, "")
     for k, axes in enumerate(stack):

@@ -33,6 +33,7 @@ class Outcome:
     files: dict[str, bytes | Path] = field(default_factory=dict)  # further ones; a path is moved in
     notes: list[str] = field(default_factory=list)  # sentences for the reader
     warnings: list[str] = field(default_factory=list)  # reasons to doubt the figures
+    setting: str = ""  # "path=value" that the figures ask for, where there is one
     verdict: str = ""  # "Consistent: ...", "With care: ..." or "Do not trust: ..."
 
     # of the request

@@ -25,6 +25,7 @@ from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoothe
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.kalman import WRONG
 from robins.filters.run import Keep, Solution, Step, everything
+from robins.filters.tally import correlated_band
 from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
@@ -351,6 +352,7 @@ def _sigma(answer: FilterEstimates, block: StateBlock) -> np.ndarray | None:
 def _innovations(answer: FilterEstimates) -> dict[str, Metric]:
     """Grand mean NIS with its band, and number of refusals, of each sensor with measurements.
 
+    The band is that of `correlated_band`, since innovations of real data are correlated.
     An H-infinity filter has no NIS, since its bound is not a covariance.
     """
     out: dict[str, Any] = {}
@@ -358,9 +360,8 @@ def _innovations(answer: FilterEstimates) -> dict[str, Metric]:
         refused = np.asarray(update.code) == Code.REFUSED
         used = np.asarray(update.dof) * ~refused
         if np.any(used) and not answer.bounds:
-            verdict = grand_mean_nis(np.asarray(update.nis), used)
-            out[f"nis_{sensor}"] = verdict.value
-            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+            out[f"nis_{sensor}"] = grand_mean_nis(np.asarray(update.nis), used).value
+            out[f"nis_{sensor}_band"] = correlated_band(int(np.sum(used))).tolist()
         if np.any(used) or np.any(refused):
             out[f"refused_{sensor}"] = int(np.sum(refused))
     return out | ({"log_likelihood": answer.log_likelihood} if answer.updates else {})

@@ -15,6 +15,7 @@ from robins.results import array
 from robins.systems.tables import SensorUpdates
 
 HELD = 0.5  # probability of being wrong above which a suspect raises an alarm
+SURE = 0.9  # probability below which it is only suspected
 _SHOWN = 4  # most spans listed in a sentence
 
 Wrong = Mapping[str, ArrayLike]
@@ -81,18 +82,25 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
     """
     worded = []
     for suspect, chance in wrong.items():
-        chance = np.nan_to_num(np.asarray(chance, float))
-        if found := spans(time_s, chance > HELD):
+        chance = np.asarray(chance, float)
+        held = [(a, b) for a, b in edges(chance > HELD) if not _as_begun(chance, a, b)]
+        if held:
+            found = [(float(time_s[a]), float(time_s[b - 1])) for a, b in held]
+            most = max(float(np.max(chance[a:b])) for a, b in held)
+            said = f"finds {words(suspect)} wrong" if most >= SURE else f"suspects {words(suspect)}"
             longest = sorted(sorted(found, key=lambda one: one[0] - one[1])[:_SHOWN])
             shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest)
             more = f" and {len(found) - _SHOWN} shorter times" if len(found) > _SHOWN else ""
-            worded.append(
-                f"{name} finds {words(suspect)} wrong: {shown}{more}; "
-                f"probability up to {np.max(chance):.2f}."
-            )
+            worded.append(f"{name} {said}: {shown}{more}; probability up to {most:.2f}.")
     if wrong and not worded:
-        return [f"{name} finds none of these wrong: {', '.join(map(words, wrong))}."]
+        return [f"{name} finds nothing wrong with {', '.join(map(words, wrong))}."]
     return worded
+
+
+def _as_begun(chance: np.ndarray, begin: int, end: int) -> bool:
+    """True if epochs begin:end open a piece of the log, and never rise above the first of them."""
+    opens = begin == 0 or np.isnan(chance[begin - 1])
+    return bool(opens and np.max(chance[begin:end]) <= chance[begin])
 
 
 def words(suspect: str) -> str:

@@ -7,7 +7,7 @@ What is only likely is marked in a comment, and what is not known is left out.
 
 Examples::
 
-    robins guess my.csv > columns.toml
+    robins guess my.csv > my.toml
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import os
 import re
 import tomllib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 
@@ -78,8 +79,11 @@ def guess(path: Log) -> str:
     head = head_of(path)
     names, separator, decimal, cells = _sheet(head)
     found, aside = _known(names)
+    if "time" not in found and (clock := _unnamed_clock(names, cells, decimal, aside)):
+        found["time"] = clock
+        del aside[clock[0]]
     used = _whole(set(found))
-    aside |= {found[q][0]: "its table is not whole" for q in set(found) - used - {"time"}}
+    aside |= {found[q][0]: _lack(q, set(found)) for q in set(found) - used - {"time"}}
     columns = {q: found[q] for q in QUANTITIES if q in used | {"time"} and q in found}
     sizes = dict(zip(head.names, map(len, head.arrays), strict=True))
     others = [name for name in sizes if name not in names]
@@ -87,7 +91,9 @@ def guess(path: Log) -> str:
     if not used:
         held = ", ".join([*names, *others][:30])
         mend = 'write the columns yourself, as "A format of your own" of docs/logs.md shows.'
-        raise InputError(f"no headings of a whole table; there are {held}", os.fspath(path), mend)
+        lacks = {_lack(q, set(found)) for q in set(found) - {"time"}}
+        what = "; ".join(["no sensor has all its headings", *sorted(lacks), f"there are {held}"])
+        raise InputError(what, os.fspath(path), mend)
     texts = {q: [row[names.index(name)] for row in cells] for q, (name, _, _) in columns.items()}
     numbers = {q: np.array([_number(text, decimal) for text in texts[q]]) for q in columns}
     with warnings.catch_warnings():
@@ -98,6 +104,8 @@ def guess(path: Log) -> str:
     taken = {name for name, _, _ in columns.values()}
     rest = [name for name in [*names, *others] if name not in taken]
     unused = [f"  {name}: {aside.get(name, 'not known')}" for name in rest]
+    if any(name in _numbered(names) for name in taken):
+        notes.append("GUESSED: 1, 2 and 3 behind a name are x, y and z")
     notes += ["not used:", *unused] if unused else []
     title = f"# {os.path.basename(path)}, by `robins guess`"
     comments = (f"# {note}" for note in notes)
@@ -111,6 +119,18 @@ def _whole(found: set[str]) -> set[str]:
     keep = {"gyro", "accel", "mag"} if imu else {"mag"} - ({"mag"} if "place" in groups else set())
     keep |= {"place", "velocity"} if "place" in groups else set()
     return {q for group in groups & keep for q in parts(group)}
+
+
+def _lack(quantity: str, found: set[str]) -> str:
+    """Reason why a quantity is left out: what its table lacks."""
+    group = next(name for name in GROUPS if quantity in parts(name))
+    needed = {"gyro": "gyro accel", "accel": "accel gyro", "velocity": "velocity place"}
+    for name in needed.get(group, group).split():
+        if lacking := [q for q in parts(name) if q not in found]:
+            left = "the three are left out" if name == group else f"no {group} is used"
+            verb = "is" if len(lacking) == 1 else "are"
+            return f"{', '.join(lacking)} {verb} not found, so {left}"
+    return "a table of fixes has no such column"
 
 
 # ------------------------------------------------------------------------------------ headings
@@ -153,8 +173,9 @@ def _known(names: Sequence[str]) -> tuple[Columns, dict[str, str]]:
     """Quantities that the names hold, and the reasons to leave others aside."""
     found: Columns = {}
     aside: dict[str, str] = {}
+    axes = _numbered(names)
     for name in names:
-        quantity, unit, doubt = _named(name)
+        quantity, unit, doubt = _named(axes.get(name, name))
         if not quantity:
             aside[name] = doubt or "not known"
         elif quantity in found:
@@ -164,8 +185,40 @@ def _known(names: Sequence[str]) -> tuple[Columns, dict[str, str]]:
     return found, aside
 
 
-def _named(name: str) -> tuple[str, str, str]:
-    """Quantity and unit that a name states, "" where it states none, and a doubt."""
+def _numbered(names: Sequence[str]) -> dict[str, str]:
+    """Names that end in 1, 2, 3, with x, y, z instead, where all three are there."""
+    cuts = {name: re.fullmatch(r"(.*[A-Za-z])[ _]?([123])(\s*[\[(].*)?", name) for name in names}
+    parted = {name: (cut[1], cut[3] or "", int(cut[2]) - 1) for name, cut in cuts.items() if cut}
+    count = Counter(around[:2] for around in parted.values())
+    return {
+        name: f"{stem}_{'xyz'[axis]}{rest}"
+        for name, (stem, rest, axis) in parted.items()
+        if count[stem, rest] == 3
+    }
+
+
+def _unnamed_clock(
+    names: Sequence[str], cells: Sequence[Sequence[str]], decimal: str, free: Mapping[str, str]
+) -> tuple[str, str, str] | None:
+    """Column that must be the time: it rises, and its unit is one of time or its steps are even.
+
+    Whole numbers that count by one may be numbers of rows, unless a unit is stated.
+    """
+    for name in (one for one in names if one in free):
+        values = np.array([_number(row[names.index(name)], decimal) for row in cells])
+        step = np.diff(values)
+        if len(step) < 2 or not (step > 0.0).all():
+            continue
+        unit, even = _stated(name)[1], np.ptp(step) < 1e-3 * np.median(step)
+        if unit in CLOCKS:
+            return name, unit, "GUESSED: it rises, and its heading has a unit of time"
+        if even and np.median(step) != 1.0:
+            return name, "", ""
+    return None
+
+
+def _stated(name: str) -> tuple[str, str, str]:
+    """Name without its unit, that unit, "" where none is stated, and a doubt."""
     base, unit, doubt = name, "", ""
     if bracketed := re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name):
         stated = re.sub(r"[\s*·]", "", bracketed[2].lower())
@@ -177,6 +230,12 @@ def _named(name: str) -> tuple[str, str, str]:
         cuts = (m.start() for m in re.finditer("_", name))
         ends = [(name[:at], _UNIT_OF.get(name[at + 1 :].lower(), "")) for at in cuts]
         base, unit = next(((b, u) for b, u in ends if u), (name, ""))
+    return base, unit, doubt
+
+
+def _named(name: str) -> tuple[str, str, str]:
+    """Quantity and unit that a name states, "" where it states none, and a doubt."""
+    base, unit, doubt = _stated(name)
     words = [w.lower() for w in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", base)]
     if column := re.search(r"\[:,([012])\]$", name):
         words.append("xyz"[int(column[1])])

@@ -11,6 +11,7 @@ Examples::
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
@@ -24,7 +25,7 @@ from robins.logs import Finding
 from robins.logs.doctor import Use
 from robins.results import Outcome, Progress, ignore_progress
 from robins.systems.finding import find_system
-from robins.workbench.doctor import parted
+from robins.workbench.doctor import parted, typed
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.formats import require_formats, with_exports
 from robins.workbench.options import Logs, Option
@@ -88,16 +89,39 @@ def replay(
     require_formats(exports, opened.system.replay_finds, f"a replay with {system}")
     progress(0.0, "reading")
     dataset = opened.read(findings)
-    then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
-    if opened.system.reads == "ranges":
-        then = f"robins list {system}   tells what can be simulated of it"
     with refusing(dataset.name):
         found = opened.system.replay(dataset, opened.parameters, chosen, part(progress, 0.1, 1.0))
     label = f"{system}/{dataset.name}"
-    labels = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    again = ["robins", "replay", typed(paths, columns)]
+    again += ["--system", system] * (system != "ins-gnss")
+    again += ["--filters", ",".join(filters)] * bool(filters)
+    again += [word for one in settings for word in ("--set", shlex.quote(one))]
+    lines = _next_lines(opened, found.setting, " ".join(again), exports)
+    labels = {"scenario": label, "seed": seed, "last_lines": lines}
     return with_exports(
         replace(found, **labels, **request_fields(opened.text, settings)), exports, label
     )
+
+
+def _next_lines(opened: OpenLog, setting: str, again: str, exports: Sequence[str]) -> list[str]:
+    """Last lines of a replay: a command to go on with.
+
+    Args:
+        opened: the log.
+        setting: that the figures ask for, "" if none.
+        again: the command of this replay.
+        exports: formats that it wrote.
+    """
+    listed = f"Next:   robins list {opened.system.name}   tells what can be simulated of it"
+    if opened.system.reads == "ranges":
+        return [listed]
+    noise = "Noise:  `robins allan` finds that of your unit, in a log at rest, if it is not set"
+    if setting:
+        what = "fixes scatter by less than assumed"
+        return [noise, f"Next:   {again} --set {shlex.quote(setting)}   {what}"]
+    if exports:
+        return [noise, listed]
+    return [noise, f"Next:   {again} --export csv   writes the estimates as a table"]
 
 
 class OpenLog(NamedTuple):

@@ -37,6 +37,7 @@ from robins.systems.ins_gnss.reported import (
     DIVERGED,
     antenna_of,
     distances,
+    fitting_sigma,
     fix_arrays,
     sigma_notes,
     verdict,
@@ -452,6 +453,7 @@ def replay(
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + notes * any(name.startswith(ROBUST) for name in wanted)
         + sigma_notes(dataset, parameters)
+        + ["Distances are to the fixes, which err too: a better path may lie farther from them."]
         + found
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=origin_ns,
@@ -459,7 +461,8 @@ def replay(
     outcome.warnings[:0] = doubts
     files = as_files(log.time_s, origin_ns, pieces, answers) if parameters.every_sample else {}
     word = verdict(answers, outcome.metrics, outcome.warnings)
-    return replace(outcome, verdict=word, files=files)
+    setting = fitting_sigma(dataset, parameters, outcome.metrics)
+    return replace(outcome, verdict=word, files=files, setting=setting)
 
 
 def _estimates(mean: InsState) -> Mapping[str, Numbers]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,8 +13,6 @@ from jaxtyping import Array
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters import Code
-from robins.filters.chi_square import chi2_band
-from robins.filters.tally import CORRELATED
 from robins.ins.state import InsState
 from robins.program.scanned import mapped_rows, named_scan
 from robins.results import Variables, array, variable
@@ -37,7 +36,27 @@ def sigma_notes(dataset: Dataset, parameters: InsGnssReplay) -> list[str]:
         shown = " ".join(f"{x:g}" for x in parameters.gnss.sigma)
         return [f"Sigmas of positions: {shown} m north, east, down, from gnss.sigma."]
     assumed = [f for f in dataset.findings if f.code == "sigma_assumed"]
-    return [f"{one.sentence} Another: {_OTHERS.get(one.where, 'gnss.sigma')}." for one in assumed]
+    return [
+        f"{one.sentence} Set {_OTHERS.get(one.where, 'gnss.sigma')} to state it." for one in assumed
+    ]
+
+
+def fitting_sigma(dataset: Dataset, parameters: InsGnssReplay, metrics: Metrics) -> str:
+    """Setting of the sigma of positions that the NIS asks for, where it is too low; "" else.
+
+    Only a sigma that is assumed, neither stated by the log nor configured, is replaced: by itself
+    times the root of the NIS, to one digit.
+    """
+    key, gnss = f"nis_{model.POSITION}", dataset.gnss
+    of = next((one for one in metrics.values() if key in one), None)
+    if of is None or gnss is None or gnss.assumed_m is None or parameters.gnss.sigma is not None:
+        return ""
+    nis, assumed = of[key], gnss.sigma_m[gnss.assumed_m.all(axis=1)]
+    if not len(assumed) or nis >= of[f"{key}_band"][0]:
+        return ""
+    fitting = np.median(assumed, axis=0) * np.sqrt(nis)
+    texts = [f"{float(f'{x:.1g}'):g} m" for x in fitting]
+    return f"gnss.sigma={json.dumps(texts)}"
 
 
 def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
@@ -112,8 +131,8 @@ def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: li
 
     "Do not trust" if sigmas are too small by a factor of two (NIS above `NIS_MOST`), more than a
     third of the fixes was refused, the estimate diverged, or it is more than `FAR` sigmas from that
-    of its smoother. "Consistent" if there is no warning and NIS is inside its 95 % band, computed
-    for one in `CORRELATED` innovations, since those of real fixes are correlated. Else "With care".
+    of its smoother. "Consistent" if there is no warning and NIS is inside its 95 % band. Else
+    "With care".
 
     Args:
         answers: estimates by filter.
@@ -125,10 +144,9 @@ def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: li
     if name is None:
         return ""
     nis, refused = metrics[name][key], metrics[name][f"refused_{model.POSITION}"]
+    low, high = metrics[name][f"{key}_band"]
     update = answers[name].updates[model.POSITION]
     spoke, unused = np.asarray(update.dof), np.asarray(update.code) == Code.REFUSED
-    independent = max(int(np.sum(spoke * ~unused)) // CORRELATED, 1)
-    low, high = chi2_band(independent, 1, 0.95) / independent
     count = int(np.sum((spoke > 0) | unused))
     parts = [f"position NIS {nis:.2f} ({low:.2f} to {high:.2f} is consistent)"]
     parts.append(f"{refused} of {count} fixes refused")
@@ -136,7 +154,7 @@ def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: li
     if (smooth := answers.get(f"{name}+rts")) is not None:
         apart = mapped_rows(_between, (answers[name].mean.position, smooth.mean.position))
         far = float(np.nanmax(np.abs(apart) / np.asarray(answers[name].sigma)[:, 6:9]))
-        parts.append(f"at most {far:.1f} sigmas from its smoother")
+        parts.append(f"at most {far:.1f} sigmas away from the smoothed path")
     own = [one for one in doubts if one.startswith(f"{name}: ")]
     if own:
         parts.append(f"{len(own)} warning{'s' * (len(own) > 1)} below")

@@ -159,7 +159,8 @@ def replay(
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
     lasted = np.asarray(log.world.u.samples.dt_s)
-    warned = monitor.of_samples(log.counts, len(log.time_ns))
+    looks, disturbed = _looks(log, answers)
+    warned = disturbed + monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
         warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
     predictions = next(iter(answers.values())).tally.counts()
@@ -171,7 +172,7 @@ def replay(
         metrics=metrics,
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
-        notes=[*_sentences(log, answers), *_about_north(dataset, north)],
+        notes=[*_sentences(log, answers), *looks, *_about_north(dataset, north)],
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
@@ -401,21 +402,44 @@ def _sentences(log: PreparedMargLog, answers: Mapping[str, FilterEstimates]) -> 
     c = log.counts
     out = [
         log.look.sentence,
-        f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log; "
-        f"{c['imu_missing']} inertial samples missing, {c['imu_saturated']} at the end of their "
-        f"range ({c['imu_bridged']} put back from their flanks), {c['imu_frozen']} in which the "
-        f"gyros hang, {c['imu_gaps']} gaps; "
-        f"{c['field_missing']} field readings missing, "
-        f"{c['field_implausible']} no field of the Earth; {c['blocks_in_free_fall']} blocks in "
-        f"free fall.",
+        f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log. Of the inertial "
+        f"samples {c['imu_missing']} are missing, {c['imu_saturated']} are at the end of their "
+        f"range ({c['imu_bridged']} put back from their flanks) and {c['imu_frozen']} repeat the "
+        f"same rate of hanging gyros; there are {c['imu_gaps']} gaps. Of the field readings "
+        f"{c['field_missing']} are missing and {c['field_implausible']} cannot be of the Earth's "
+        f"field. {c['blocks_in_free_fall']} blocks are in free fall.",
     ]
+    return out + [_turned_from_to(log, answer) for answer in answers.values()]
+
+
+def _turned_from_to(log: PreparedMargLog, answer: FilterEstimates) -> str:
+    """Sentence on the attitude at the first and at the last epoch, with its sigma."""
+    said = []
+    for at in (0, -1):
+        euler = np.degrees(rotation.to_euler(jnp.asarray(answer.mean.q_nb.wxyz)[at]))
+        north, east, heading = np.degrees(answer.sigma[at, :3])
+        said.append(
+            f"at {log.epoch_s[at]:.1f} s roll {euler[0]:.1f}, pitch {euler[1]:.1f}, heading "
+            f"{euler[2] % 360.0:.1f} deg (sigma of the tilt {max(north, east):.1f}, of the heading "
+            f"{heading:.1f} deg)"
+        )
+    return f"{answer.name}: {', '.join(said)}."
+
+
+def _looks(
+    log: PreparedMargLog, answers: Mapping[str, FilterEstimates]
+) -> tuple[list[str], list[str]]:
+    """Sentences on refused looks at the field, and warnings where they are a third or more."""
+    notes, warned = [], []
     for name, answer in answers.items():
         refused = _refused(log, answer)
-        update = answer.updates.get(model.MAGNETOMETER)
+        update, count = answer.updates.get(model.MAGNETOMETER), int(np.sum(refused))
         looked = 0 if update is None else int(np.sum((update.dof > 0) | refused))
-        if looked:
-            out.append(
-                f"{name}: the field was disturbed at {np.sum(refused)} of {looked} looks; heading "
+        if looked and not count:
+            notes.append(f"{name}: the field was undisturbed at all {looked} looks.")
+        elif looked:
+            (warned if count >= looked / 3 else notes).append(
+                f"{name}: the field was disturbed at {count} of {looked} looks; heading "
                 "then came from the gyros."
             )
-    return out
+    return notes, warned
