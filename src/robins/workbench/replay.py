@@ -92,15 +92,20 @@ def replay(
     with refusing(dataset.name):
         found = opened.system.replay(dataset, opened.parameters, chosen, part(progress, 0.1, 1.0))
     label = f"{system}/{dataset.name}"
-    again = ["robins", "replay", typed(paths, columns)]
-    again += ["--system", system] * (system != "ins-gnss")
-    again += ["--filters", ",".join(filters)] * bool(filters)
-    again += [word for one in settings for word in ("--set", shlex.quote(one))]
-    lines = _next_lines(opened, found.setting, " ".join(again), exports)
+    again = _command(typed(paths, columns), system, filters, settings)
+    lines = _next_lines(opened, found.setting, again, exports)
     labels = {"scenario": label, "seed": seed, "last_lines": lines}
     return with_exports(
         replace(found, **labels, **request_fields(opened.text, settings)), exports, label
     )
+
+
+def _command(files: str, system: str, filters: Sequence[str], settings: Sequence[str]) -> str:
+    """Command line of this replay."""
+    words = ["robins", "replay", files]
+    words += ["--system", system] * (system != "ins-gnss")
+    words += ["--filters", ",".join(filters)] * bool(filters)
+    return " ".join([*words, *(f"--set {shlex.quote(one)}" for one in settings)])
 
 
 def _next_lines(opened: OpenLog, setting: str, again: str, exports: Sequence[str]) -> list[str]:
