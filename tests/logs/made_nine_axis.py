@@ -99,6 +99,6 @@ def level_dataset():
     time_ns, source = np.round(t * 1e9).astype(np.int64), "level.csv"
     return Dataset(
         "level",
-        ImuTable(time_ns, gyro, force, "rate", source=source, body="FLU"),
-        mag=MagTable(time_ns, field * 1e-6, source=source, body="FLU"),
+        ImuTable(time_ns, gyro, force, "rate", source=source, body="RFU"),
+        mag=MagTable(time_ns, field * 1e-6, source=source, body="RFU"),
     )

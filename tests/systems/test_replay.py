@@ -264,7 +264,8 @@ def test_a_short_gap_is_bridged_with_more_noise_and_a_long_one_declared(log):
     assert long.counts["imu_gaps_declared"] == 1
     lat = long.solution["lat_rad"].values[0]
     assert np.sum(np.isnan(lat)) == 1, "one epoch of NaN breaks the curve at the gap"
-    assert len(long.notes) == 2, "each piece says how it was aligned"
+    starts = [note for note in long.notes if note.startswith("Start:")]
+    assert len(starts) == 2, "each piece says how it was aligned"
     assert np.max(np.diff(long.solution.time.values)) > end_s - begin_s
 
 

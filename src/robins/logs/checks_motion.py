@@ -2,10 +2,6 @@
 
 All are estimated, each with its sigma (`motion_models`). A unit, an order of axes or a leap second
 is named only if it agrees with the estimate within three sigmas; else the number is stated.
-
-Also of an IMU by itself that was turned about, by the constancy of gravity. That is weaker, since
-the sensor's own acceleration disturbs it and a reflection of both triads looks like gyros of the
-opposite sense; used if GNSS gives no result.
 """
 
 from __future__ import annotations
@@ -16,26 +12,20 @@ import numpy as np
 
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.findings import Finding
-from robins.logs.gnss_motion import lowest, track_of
+from robins.logs.gnss_motion import track_of
 from robins.logs.motion import (
-    GRAVITY,
     power_of,
     signed_permutations,
-    squares_by_map,
-    stationary_integrals,
 )
 from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE
 from robins.logs.motion_models import OF_GYROS, ModelChoice, judge
-from robins.logs.motion_models import SCALES as STARTS
 from robins.logs.quiet import (
     error,
     finding,
     name_of,
     note,
     signal_of,
-    usual_force,
     warning,
-    windows_of,
 )
 
 _DEG = np.pi / 180
@@ -73,9 +63,6 @@ _STEP_S = 5.0  # no buffer delays a fix by more
 _LEAST_S, _LEAST_SCALE = 0.01, 0.01  # least sigmas of a clock and of a gyro scale
 _WELL, _CHI = 0.05, 3.0  # unexplained share for naming causes, or in stated noise
 _GOOD = 0.5  # largest unexplained share of consistent data
-_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise for gravity alone
-_TIED = 1e-3  # difference of shares that noise makes
-_TURNED_SIGMA = 0.03  # sigma of a gyro scale from gravity alone
 
 
 def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
@@ -273,7 +260,7 @@ def _gyros(
             "turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
             f"{value:.4g} +- {sigma:.2g} {share}"
         )
-        out.append(_unit(imu, value, sigma, step_s, shown))
+        out.append(unit_finding(imu, value, sigma, step_s, shown))
     elif not alike:
         out += [
             error(imu, "gyro_scale", v)(
@@ -300,7 +287,7 @@ def _named(value: float, sigma: float, names: dict[float, tuple[str, str]]) -> t
     return names[near[0]] if len(near) == 1 else None
 
 
-def _unit(imu: ImuTable, value: float, sigma: float, step_s: float, shown: str) -> Finding:
+def unit_finding(imu: ImuTable, value: float, sigma: float, step_s: float, shown: str) -> Finding:
     """Finding about a common factor of all gyros, named if it is that of a usual unit."""
     names = _UNITS | {
         step_s: ("rates where increments are expected", f"multiply by {step_s:g} s"),
@@ -450,59 +437,3 @@ def words_of(S: np.ndarray, sensor: str) -> str:
         j = int(np.argmax(np.abs(row)))
         parts.append(f"{'-' if row[j] < 0 else ''}{sensor}_{'xyz'[j]}")
     return f"({', '.join(parts)})"
-
-
-def check_turning(imu: ImuTable) -> Iterator[Finding]:
-    """Findings about gyros inconsistent with the rotation of gravity in accelerometer axes."""
-    signal = signal_of(imu)
-    if signal is None:
-        return
-    size = usual_force(windows_of(signal))
-    if not size > 0.0:
-        return
-    views = stationary_integrals(signal._replace(accel=signal.accel * (GRAVITY / size)), imu.kind)
-    if views is None:
-        return
-    scales = np.array([*STARTS, 0.0])  # the last: no rotation
-    maps = np.concatenate([signed_permutations(), scales[:, None, None] * np.eye(3)])
-    squares = squares_by_map(views, maps, np.zeros(len(views.start_s)))[:, 0]
-    left = squares / np.sum(power_of(views))
-    if not left[0] > _TURNED_WRONG:
-        return
-    k, tied = _simplest(maps, left)
-    # A vehicle that only accelerates is explained without rotation, and gives no evidence on it.
-    if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * left[0], 0.5 * left[-1]):
-        return
-    shown = (
-        "turned about, the gyros do not turn gravity as the accelerometers see it turn "
-        f"({left[0]:.0%} of it is left over, with other gyro columns {left[k]:.0%})"
-    )
-    if k >= 48:
-        near = lowest(np.log(scales[k - 49 : k - 46]), left[k - 1 : k + 2])
-        value = float(scales[k - 48] if near is None else np.exp(near))
-        yield _unit(imu, value, _TURNED_SIGMA * value, signal.step_s, shown)
-    elif np.array_equal(maps[k], -np.eye(3)):
-        yield error(imu, "left_handed", float(left[k]))(
-            f"{shown}. The gyros have the opposite sense of rotation, or both triads are "
-            "left-handed: two axes exchanged or one reversed, alike in both."
-        )
-    else:
-        hardly = " It turned too little about the other axes to test them." if tied else ""
-        yield error(imu, "gyro_axes", float(left[k]))(
-            f"{shown}. The gyros fit as {words_of(maps[k], 'gyro')}; or the accelerometers' "
-            f"columns were exchanged or reversed accordingly.{hardly}"
-        )
-
-
-def _simplest(maps: np.ndarray, left: np.ndarray) -> tuple[int, bool]:
-    """Index of the map that changes fewest columns of those that fit about best, and if others do.
-
-    Args:
-        maps: (k, 3, 3) gyro maps.
-        left: (k,) unexplained share of each.
-    """
-    best = float(np.min(left))
-    near = np.flatnonzero(left <= max(1.5 * best, best + _TIED))
-    changed = np.any(np.abs(maps[near] - np.eye(3)) > 1e-9, axis=2).sum(axis=1)
-    order = np.lexsort((left[near], changed))
-    return int(near[order[0]]), len(near) > 1

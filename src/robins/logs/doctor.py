@@ -22,8 +22,9 @@ from robins.logs.checks_gnss import check_gnss, check_velocity
 from robins.logs.checks_imu import check_columns, check_imu
 from robins.logs.checks_mag import check_mag, check_mag_axes
 from robins.logs.checks_master import check_master
-from robins.logs.checks_motion import check_motion, check_turning
+from robins.logs.checks_motion import check_motion
 from robins.logs.checks_time import check_span, check_time
+from robins.logs.checks_turning import check_turning
 from robins.logs.findings import Finding, by_severity
 from robins.logs.limits import check_limits
 from robins.logs.tables import KINDS, Table, checked, kind_of, tables_of
