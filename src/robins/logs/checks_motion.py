@@ -13,12 +13,9 @@ import numpy as np
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.findings import Finding
 from robins.logs.gnss_motion import track_of
-from robins.logs.motion import (
-    power_of,
-    signed_permutations,
-)
+from robins.logs.motion import power_of, signed_permutations
 from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE
-from robins.logs.motion_models import OF_GYROS, ModelChoice, judge
+from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import (
     error,
     finding,
@@ -80,14 +77,14 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         )
         return
     found = estimates(verdict)
-    both = "forces" in verdict.free and bool(OF_GYROS & {*verdict.free})
+    both = "forces" in verdict.free and bool({"gyros", "scale"} & {*verdict.free})
     if verdict.rival or both or (verdict.free and not explained(verdict)) or left > _GOOD:
         yield from _unclear(imu, gnss, verdict, left, found)
         return
     before = verdict.nothing.left(verdict.views)
     share = f"(then {left:.0%} of the change of velocity is left unexplained, now {_all(before)})"
     wrong = []
-    if OF_GYROS & {*verdict.free}:
+    if {"gyros", "scale"} & {*verdict.free}:
         wrong += _gyros(imu, verdict, found, signal.step_s, share)
     if "forces" in verdict.free:
         wrong += _forces(imu, found, share)
@@ -199,7 +196,6 @@ def _unclear(
         tried = {
             "clock": f"a shift of {shift:+.2f} +- {s:.2f} s",
             "scale": f"a factor of {factor:.3g} +- {of_factor:.2g} of the gyros",
-            "turn": "gyros turned against the accelerometers",
             "gyros": "another gyro unit, exchanged or reversed axes",
             "forces": "other accelerometers",
         }

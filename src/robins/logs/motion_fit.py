@@ -346,8 +346,7 @@ def prior_of(parts: int = 1, *free: str) -> np.ndarray:
 
     Args:
         parts: number of parts of the log with separate clock offsets.
-        free: among "offset", "rate", "scale" (common to all gyros), "turn" (of their triad),
-            "gyros", "forces".
+        free: among "offset", "rate", "scale" (common to all gyros), "gyros", "forces".
     """
     sigma = np.empty(OFFSET + parts)
     sigma[SCALE] = 0.3 if "gyros" in free else 0.02
@@ -359,7 +358,4 @@ def prior_of(parts: int = 1, *free: str) -> np.ndarray:
     if "scale" in free:
         alike = np.eye(3).ravel()
         out[SCALE, SCALE] += 0.3**2 * np.outer(alike, alike)
-    if "turn" in free:
-        about = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
-        out[SCALE, SCALE] += 0.3**2 * about.T @ about
     return out

@@ -31,12 +31,10 @@ SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # gyro scales at whi
 _BLOCKS = {
     "clock": ("offset", "rate"),
     "scale": ("scale",),
-    "turn": ("turn",),
     "gyros": ("gyros",),
     "forces": ("forces",),
 }
-OF_GYROS = {"scale", "turn", "gyros"}  # the first two are parts of the last
-_COST = {"clock": 2, "scale": 1, "turn": 3, "gyros": 9, "forces": 6}  # parameters
+_COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
 _SUSPICIOUS = 0.02, 0.3  # unexplained shares, of all and of a stretch, to search starts
 _CLOSE_S, _NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 5.0, 60.0, 4000.0, 0.1, 0.5
@@ -44,8 +42,7 @@ _NOISY = 1.25  # residual squares, relative to the stated noise, that count as n
 _SWITCH = 12.0  # cost that a clock step must save to be tried
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
 _PART = 5.0  # log-likelihood that each part with an own offset must gain
-# Starts from which a fit is tried.
-_PROMISING = {"clock": 3, "scale": 1, "turn": 1, "gyros": 2, "forces": 1}
+_PROMISING = {"clock": 3, "scale": 1, "gyros": 2, "forces": 1}  # starts from which a fit is tried
 _ROUNDS = 14
 _LEAST_SHARE = 1e-4  # unexplained share below which no block is freed
 
@@ -57,7 +54,7 @@ class ModelChoice(NamedTuple):
     nothing: MotionFit  # with nuisance parameters only
     clocked: MotionFit  # likewise, with a free clock
     fit: MotionFit  # with the free blocks
-    free: tuple[str, ...]  # among `_BLOCKS`, by decreasing improvement
+    free: tuple[str, ...]  # "clock", "gyros", "forces", by decreasing improvement
     rival: str  # a block that fits nearly as well as the first, or ""
     factor: float  # applied to specific forces beforehand, from gravity
 
@@ -127,7 +124,7 @@ def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tup
         first = order[0]
         if not gain[first] > _CLEAR:
             break
-        others = [b for b in order[1:] if not {b, first} <= OF_GYROS]
+        others = [b for b in order[1:] if not {b, first} <= {"scale", "gyros"}]
         if not free and gain[others[0]] > gain[first] - _CLEAR:
             rival = others[0]
         best, free = fits[first], (*free, first)
@@ -181,7 +178,7 @@ def _starts(
     far = bool(best.left(views) > usual or np.any(odd))
     if far:
         out.append(state)
-    if block == "clock" and not OF_GYROS & {*free}:
+    if block == "clock" and not {"gyros", "scale"} & {*free}:
         out += _clocks(views, best, far)
     if far and block in ("gyros", "scale"):
         axes = signed_permutations()
@@ -194,7 +191,7 @@ def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> P
     out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
     if "clock" in free:
         out = out._replace(offset=state.offset, rate=state.rate, part=state.part)
-    if OF_GYROS & {*free}:
+    if {"gyros", "scale"} & {*free}:
         out = out._replace(M_g=state.M_g)
     return out._replace(M_a=state.M_a) if "forces" in free else out
 
