@@ -132,7 +132,7 @@ def views_of(
         length_s=max(float(end[k[-1]] - begin[k[0]]) for k in chosen),
         middle_s=0.5 * float(start[0] + start[-1]),
         stride=stride,
-        noise=scatter,
+        noise=float(scatter),
     )
 
 
