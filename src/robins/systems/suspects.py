@@ -98,9 +98,9 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
 
 
 def _as_begun(chance: np.ndarray, begin: int, end: int) -> bool:
-    """True if epochs begin:end open a piece of the log, and never rise above the first of them."""
+    """True if epochs begin:end open a piece of the log, unsure, and never rise above the first."""
     opens = begin == 0 or np.isnan(chance[begin - 1])
-    return bool(opens and np.max(chance[begin:end]) <= chance[begin])
+    return bool(opens and np.max(chance[begin:end]) <= chance[begin] < SURE)
 
 
 def words(suspect: str) -> str:
