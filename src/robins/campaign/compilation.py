@@ -19,7 +19,7 @@ SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program
 
 
 class CompilationTrigger:
-    """The loops of a campaign, interpreted until compiling them pays."""
+    """Start of compiling the loops of a campaign, interpreted until that saves time."""
 
     def __init__(self, stages: Sequence[StagedFunction]):
         self._loops: list[AxisLoop] = [

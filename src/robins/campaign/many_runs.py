@@ -74,7 +74,7 @@ class ManyRuns:
 
     @property
     def notes(self) -> list[str]:
-        """Parts that JAX computed in any call, each reason once."""
+        """Reasons why parts stayed with JAX in any call, each once."""
         refused = [*self._refused, *map(str, self._staged.refused if self._staged else [])]
         return [f"a part stays with JAX, as {why}" for why in dict.fromkeys(refused)]
 

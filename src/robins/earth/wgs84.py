@@ -161,7 +161,7 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     TR8350.2, eq. 4-5 to 4-20), exact at every height; on the ellipsoid it is Somigliana's formula.
     Above the ellipsoid the plumb line is curved: the north component is -8.1e-9 sin(2 lat) per
     metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Given NumPy arrays it returns one, and
-    nothing is compiled.
+    nothing is compiled. The mechanisation evaluates `robins.ins.zonal_gravity`: change both.
 
     Raises:
         ValueError: a height is below -1000 km; not in compiled code.
@@ -196,7 +196,7 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     poleward = spin_sq * (A_M**2 * q_ratio * per_v_sq - 1.0)
 
     # The two components along the confocal axes, rotated to the polar axis and the equator plane;
-    # no square root of v_sq and few divisions, because this runs at every IMU sample.
+    # no square root of v_sq and few divisions.
     across = -p * (inward * u + poleward * sin_sq * v_sq) / spread
     axial = -z * (inward * v_sq * per_u - poleward * p * p) / spread
     north = axial * cos_lat - across * sin_lat

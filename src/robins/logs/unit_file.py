@@ -194,7 +194,7 @@ def toml_of(
         receiver.append(
             f"lasting_share = {found.lasting_share:.3g}  # of the variance of positions"
         )
-    receiver.append('# lever_arm = ["0 m", "0 m", "0 m"]  # IMU to antenna; a log does not tell it')
+    receiver.append('# lever_arm = ["0 m", "0 m", "0 m"]  # IMU to antenna; measure it')
     for name, rows in (("imu", unit), ("gnss", receiver)):
         lines += [f"[{name}]", *rows, ""] if rows else []
     return "\n".join(lines)

@@ -125,7 +125,7 @@ def total(power: Array, white: WhitenedInnovation) -> Array:
     return jnp.sum(jnp.where(white.counts, power, 0.0))
 
 
-def ratio(N: Array, M: Array, limit: Number) -> Array:
+def fading_factor(N: Array, M: Array, limit: Number) -> Array:
     """Fading factor max(1, N / M), at most ``limit``; 1 where M is 0."""
     solid = M > 0.0
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
@@ -174,12 +174,12 @@ def faded(
         return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
 
     if form != "multiple" or weights is None:
-        factor = ratio(N, white.predicted, limit)
+        factor = fading_factor(N, white.predicted, limit)
         if form != "projected":
             return jnp.sqrt(factor) * S, factor
         return jax.lax.cond(factor > 1.0, wider, lambda: S), factor
     each = jnp.sum((S @ white.spread.T) * seen_by(white.spread, S).T, axis=1)  # (P H' H)_jj
-    factor = ratio(N, jnp.sum(weights * each) + white.left_over, limit)
+    factor = fading_factor(N, jnp.sum(weights * each) + white.left_over, limit)
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
 
 

@@ -58,7 +58,7 @@ _FREE_M, _FREE_CLOCK_M = 1e3, 1e5  # process noise per epoch for least squares: 
 
 
 class GnssState(NamedTuple):
-    """State, or states of a run with leading axis E."""
+    """State of tight GNSS, or states of a run with leading axis E."""
 
     position: Any  # (3,) m, NED
     direction: Any  # (2,) north, east

@@ -105,7 +105,7 @@ class Outages(Parameters):
     last: q.Time  # no outage begins this shortly before the last fix
 
     def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
-        """Mask (N,) of the times in an outage; outages repeat up to `last` before the last fix.
+        """Mask (N,), true in an outage; none begins within `last` of the last fix.
 
         The first and the last fix are at `first_s` and `last_s`.
         """

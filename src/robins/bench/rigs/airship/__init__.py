@@ -60,7 +60,7 @@ WIRE = Wire(
 
 
 def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
-    """Radar fix that matches a wrong place."""
+    """Offset the radar fix, as a match with a wrong place does."""
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 

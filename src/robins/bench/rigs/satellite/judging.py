@@ -395,7 +395,7 @@ SAYS = {
 
 
 def view() -> PageView:
-    """Page of the satellite."""
+    """Layout of the live page of the satellite."""
     return PageView(signals, sample, Alarms, counts, OFFERED, SAYS)
 
 
