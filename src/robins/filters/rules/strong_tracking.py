@@ -164,7 +164,7 @@ def _faded_outside(
     noise = jnp.where(memory.fresh, memory.noise, 0.0)
     H = _fading.seen_by(white.spread, S)
     M = jnp.sum((H @ moved) ** 2) + white.left_over
-    factor = _fading.ratio(N - jnp.sum((H @ noise) ** 2), M, limit)
+    factor = _fading.fading_factor(N - jnp.sum((H @ noise) ** 2), M, limit)
     more = factor > 1.0
     gain = jnp.sqrt(jnp.where(more, factor - 1.0, 1.0))
     return jax.lax.cond(more, lambda: linalg.tria(S, gain * moved), lambda: S), factor
