@@ -269,10 +269,10 @@ def _other_gyros(
                 "Compare both with the data sheet."
             )
         else:
-            unit, mend = SCALES[factor]
+            unit, fix = SCALES[factor]
             yield error(imu, "gyro_unit", factor)(
                 f"{shown} if the rates are multiplied by {factor:.4g}. The gyro columns are "
-                f"probably {unit}: {mend}."
+                f"probably {unit}: {fix}."
             )
         return
 

@@ -22,6 +22,9 @@ MAVLINK = PX4 | {7: 1, 8: 6}
 _USUAL = {1: (0.02, 0.05), 2: (0.3, 0.1), 3: (1.0, 0.2), 4: (1.0, 0.2), 5: (3.0, 0.3)}
 _USUAL[6] = (0.1, 0.1)
 """Usual sigmas of horizontal position [m] and velocity [m/s] of each kind, in the open."""
+_SHAPE = np.array([1.0, 1.0, 2.0])  # vertical sigmas are twice the horizontal ones
+SINGLE_M = _USUAL[5][0] * _SHAPE
+"""Usual sigmas (3,) of a single position, north, east, down [m]."""
 _ASSUMED = {
     "place": "0.02 m for fixed, 0.3 m for float, 3 m for single ones",
     "velocity": "0.05 m/s for fixed, 0.1 m/s for float, 0.3 m/s for single ones",
@@ -82,14 +85,13 @@ def with_usual_sigmas(table: GnssTable, findings: Findings, places: bool = True)
     """
     kinds = np.zeros(len(table), np.int64) if table.quality is None else table.quality
     usual = np.array([_USUAL.get(int(k), _USUAL[5]) for k in kinds]).reshape(-1, 2)
-    shape = np.array([1.0, 1.0, 2.0])
     lacking = np.isnan(table.sigma_m) & np.isfinite(table.lat_rad)[:, None] & places
-    sigma_m = np.where(lacking, usual[:, :1] * shape, table.sigma_m)
+    sigma_m = np.where(lacking, usual[:, :1] * _SHAPE, table.sigma_m)
     sigma_v, count, assumed_v = table.sigma_v, lacking.any(axis=1), table.assumed_v
     assumed = ["place"] if count.any() else []
     if table.v_n is not None and sigma_v is not None:
         unstated = np.isnan(sigma_v) & np.isfinite(table.v_n)
-        sigma_v = np.where(unstated, usual[:, 1:] * shape, sigma_v)
+        sigma_v = np.where(unstated, usual[:, 1:] * _SHAPE, sigma_v)
         count, assumed_v = count | unstated.any(axis=1), _either(unstated, assumed_v)
         assumed += ["velocity"] if unstated.any() else []
     if count.any():

@@ -8,6 +8,7 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.earth import curvature_radii
+from robins.logs.fix_kinds import SINGLE_M
 from robins.logs.limits import ALT_LIMIT_M, SPEED_LIMIT
 from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
@@ -16,7 +17,6 @@ _BASE_S = 1.0
 _BASES_S = (_BASE_S, 2.0, 4.0, 8.0)  # the shortest one with enough motion is used
 _SPEED = 0.3  # m/s; a slower receiver is at rest
 _NORMAL = 0.6745  # median size of a standard normal number
-_USUAL_M = np.array([3.0, 3.0, 6.0])  # of a single fix in the open, north, east, down
 _KEPT = 0.9  # share of the steps, those that fit best, used for the delay of velocities
 
 
@@ -76,7 +76,7 @@ def _sigmas(gnss: GnssTable, rows: np.ndarray, r_n: np.ndarray) -> np.ndarray:
     rough = np.median(np.abs(np.diff(r_n, 3, axis=0)), axis=0) / (_NORMAL * np.sqrt(20.0))
     lacking = np.isnan(stated).all(axis=0)
     known = np.nanmedian(np.where(lacking, 0.0, stated), axis=0)
-    return np.where(lacking, np.minimum(rough, _USUAL_M), known)
+    return np.where(lacking, np.minimum(rough, SINGLE_M), known)
 
 
 class PositionSteps(NamedTuple):

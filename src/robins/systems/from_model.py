@@ -6,7 +6,7 @@ For a first system. The true state at the start is drawn from the belief, and th
 
 with L and R the factors of the model's noise. A correct filter is then consistent: its errors
 are as large as its sigmas, and its NEES and NIS lie in their bands. Replace parts of the study by
-`dataclasses.replace` as the system grows: `simulate` when the world differs from the model, `view`
+`dataclasses.replace` as the system grows: `simulate` when the world text from the model, `view`
 when the report needs axes.
 """
 
@@ -118,8 +118,8 @@ def tried(model: Model, x: State) -> None:
     model.motion.noise_factor(x, None)
     for sensor in model.sensors:
         name, size = sensor.name, manifold.dim(sensor.reading(x, None))
-        told = f"sensor '{name}' reads {size} numbers, and its noise (or dim=) is of {sensor.dim}"
-        require(size == sensor.dim, told)
+        text = f"sensor '{name}' reads {size} numbers, and its noise (or dim=) is of {sensor.dim}"
+        require(size == sensor.dim, text)
         sensor.noise_factor(x, None)
 
 
@@ -172,7 +172,7 @@ def blocks(start: Belief, states: Mapping[str, str] | None) -> list[StateBlock]:
     """State block of each component of the error.
 
     Raises:
-        ValueError: the number of names differs from that of components.
+        ValueError: the number of names text from that of components.
     """
     n = start.factor.shape[-1]
     named = dict.fromkeys((f"x{k}" for k in range(n)), "1") if states is None else states

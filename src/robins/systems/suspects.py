@@ -87,11 +87,11 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
         if held:
             found = [(float(time_s[a]), float(time_s[b - 1])) for a, b in held]
             most = max(float(np.max(chance[a:b])) for a, b in held)
-            said = f"finds {words(suspect)} wrong" if most >= SURE else f"suspects {words(suspect)}"
+            verb = f"finds {words(suspect)} wrong" if most >= SURE else f"suspects {words(suspect)}"
             longest = sorted(sorted(found, key=lambda one: one[0] - one[1])[:_SHOWN])
             shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest)
             more = f" and {len(found) - _SHOWN} shorter times" if len(found) > _SHOWN else ""
-            worded.append(f"{name} {said}: {shown}{more}; probability up to {most:.2f}.")
+            worded.append(f"{name} {verb}: {shown}{more}; probability up to {most:.2f}.")
     if wrong and not worded:
         return [f"{name} finds nothing wrong with {', '.join(map(words, wrong))}."]
     return worded
