@@ -8,13 +8,11 @@ replay does.
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins import rotation
-from robins.program.evaluated import evaluated
 from robins.program.scanned import named_scan
 from robins.systems.ins_gnss.parameters import Gnss, InsGnssStart
 from robins.systems.ins_gnss.recording import Log
@@ -39,13 +37,8 @@ def _turned_by(q: Array, theta: Array) -> tuple[Array, Array]:
 
 def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
     """Attitude q_nb (4,) with the same tilt and another heading."""
-
-    def turned_to(q_nb, heading_rad):
-        _, _, now = rotation.to_euler(q_nb)
-        turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
-        return rotation.multiply(turn, q_nb)
-
-    return np.asarray(evaluated(turned_to, q_nb, heading_rad))
+    turn = SciRotation.from_rotvec([0.0, 0.0, heading_rad - heading_of(q_nb)])
+    return (turn * SciRotation.from_quat(q_nb, scalar_first=True)).as_quat(scalar_first=True)
 
 
 def heading_of(q_nb: np.ndarray) -> float:
