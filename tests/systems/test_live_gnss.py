@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.filters import Belief, Code, kalman
+from robins.filters import Belief, Code, doubts, kalman
 from robins.logs import load_ranges
 from robins.program.names import by_name
 from robins.results import ResultError, ignore_progress
@@ -134,14 +134,16 @@ def replayed(log):
     o, C = np.asarray(path.place.origin_e), np.asarray(path.place.C_en)
     places = np.stack([o + C @ p for p in np.asarray(mean.position)])
     time_ns = path.begin_ns + np.round(1e9 * of.epoch_s).astype(np.int64)
-    return time_ns, places, sigma[:, :3], np.asarray(mean.direction)
+    doubted = doubts(answers["delays"].tally, assumed=(LENGTH,))
+    return time_ns, places, sigma[:, :3], np.asarray(mean.direction), doubted
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.17], ids=["at once", "late"])
 def test_answers_at_epochs_have_the_bits_of_a_replay(live, log, replayed, late_s):
     answer, passed = played(live, records(log, late_s))
     assert not live.counts
-    time_ns, places, sigma, direction = replayed
+    time_ns, places, sigma, direction, doubted = replayed
+    assert live.doubts() == doubted
     assert [one.time_ns for one in passed] == time_ns.tolist()
     np.testing.assert_array_equal([one.r_e for one in passed], places)
     np.testing.assert_array_equal([one.sigma_m for one in passed], sigma)

@@ -14,7 +14,7 @@ from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.results import ResultError
 from robins.systems import replaying
-from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset, model
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.path import InsGnssPath, row_of
 from robins.systems.ins_gnss.positions import heading_of
@@ -165,6 +165,22 @@ def test_epochs_are_those_of_the_replay(live, log, order):
     assert np.mean(started) > 0.6
     assert (live.counts["steps_again"] > 20) == (order != "at once")
     assert live.start.startswith("levelled at rest")
+    assert live.doubts() == []
+
+
+def test_sigmas_that_are_too_small_are_doubted_as_in_a_replay(live, log):
+    """A late fix, for which steps are repeated, counts once among the innovations judged."""
+    sure = replace(log, gnss=replace(log.gnss, sigma_m=0.2 * log.gnss.sigma_m))
+    count, found = len(log.gnss), []
+    for late_s in (np.zeros(count), np.where(np.arange(count) % 2 == 0, 0.72, 0.1)):
+        live.start_over()
+        played(live, sure, events(sure, late_s))
+        found.append(live.doubts())
+    refused = f"measurements of '{model.POSITION}' were refused"
+    assert refused in found[0][0]
+    assert live.counts["steps_again"] > 20
+    assert found[1] == found[0]
+    assert refused in SYSTEM.replay(sure, InsGnssReplay(), ("ekf",)).warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jax.tree_util import tree_map
@@ -25,6 +25,19 @@ WINDOW = 400  # last updates of each sensor that are judged
 
 _DONE = int(Code.DONE)
 _NAMES = {int(code): code.name for code in Code}
+
+
+class WatchedStep(NamedTuple):
+    """Kept part of a step whose updates count for `OnlineFilter.doubts`."""
+
+    value: Data  # returned by `OnlineFilter.step`
+    info: dict[str, StepInfo]
+
+    @classmethod
+    def of(cls, step: Step, value: Data) -> WatchedStep:
+        """Part ``value`` of a step, and of its updates what is judged."""
+        judged = {k: i._replace(factor=(), gain=(), notes={}) for k, i in step.info.items()}
+        return cls(value, judged)
 
 
 class OnlineFilter:
@@ -104,14 +117,15 @@ class OnlineFilter:
         """Take a whole step in one compiled call: predict, then update with each sensor in y.
 
         Measurements have the same shapes at every call, with NaN where missing; unlike those of
-        `update` they are not checked. `keep` is the part of the `Step` to return, as in `run`.
+        `update` they are not checked. `keep` is the part of the `Step` to return, as in `run`, or
+        a `WatchedStep` of it.
         """
         kept, (moved, used) = self._machine.step(u, dict(y), dict(aux or {}), keep)
         self._count(moved, *used.values())
-        if isinstance(kept, Step):
+        if isinstance(kept, Step | WatchedStep):
             for sensor, info in kept.info.items():
                 self._remember(sensor, info, y[sensor])
-        return kept
+        return kept.value if isinstance(kept, WatchedStep) else kept
 
     def update(self, y: Data, sensor: str | None = None, aux: Data = None) -> StepInfo:
         """Update with a measurement; NaN is missing. A model of one sensor needs no `sensor` name.
@@ -135,8 +149,8 @@ class OnlineFilter:
     def doubts(self, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
         """Sentences on reasons to doubt the last 400 updates of each sensor.
 
-        Updates by `step` count if it keeps the whole `Step`. The false-alarm probability holds for
-        one call. Arguments are those of `robins.filters.doubts`.
+        Updates by `step` count if it keeps the whole `Step`, or a `WatchedStep`. The false-alarm
+        probability holds for one call. Arguments are those of `robins.filters.doubts`.
         """
         tally = Tally.blank(tuple(self._last))
         info, readings = {}, {}
@@ -149,6 +163,12 @@ class OnlineFilter:
             tally.dof[sensor] = np.sum(np.where(judged, dof, 0))
         return doubts(tally.looking(info, readings), bounds, assumed)
 
+    def forget(self, steps: int) -> None:
+        """Let the last steps, from which the caller goes back, not count for `doubts`."""
+        for kept in self._last.values():
+            for _ in range(min(steps, len(kept))):
+                kept.pop()
+
     def look(self, question: Callable[..., T], *args: Data) -> T:
         """Return ``question(filter, model, state, *args)``, compiled; the state is unchanged.
 
@@ -159,7 +179,7 @@ class OnlineFilter:
 
     def _remember(self, sensor: str, info: StepInfo, y: State) -> None:
         """Keep an update for `doubts`."""
-        kept = self._copied((info._replace(gain=(), notes={}), y))
+        kept = self._copied((info._replace(factor=(), gain=(), notes={}), y))
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
     def _copied(self, tree: T) -> T:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from enum import IntFlag
 from functools import partial
@@ -188,6 +188,7 @@ class Live:
     _parameters: ClassVar[type[Any]]  # class of the constructor's parameters
     _kept: ClassVar[tuple[str, ...]]  # names of attributes that change, plain values or arrays
     _parts: ClassVar[tuple[str, ...]]  # names of objects with such attributes
+    _assumed: ClassVar[Collection[str]] = ()  # sensors whose noise is a guess, as in a replay
     _on: Callable[[Belief | FilterState], OnlineFilter]  # the filter from an initial state
     _compiled_state: PyTree = None  # a filter state, for its structure and shapes
     _online: OnlineFilter | None = None  # set at the start
@@ -197,6 +198,13 @@ class Live:
         self.parameters: Any = parameters
         self.counts: Counter[str] = Counter()
         self._made_with = made_with
+
+    def doubts(self) -> list[str]:
+        """Sentences on reasons to doubt the last 400 updates of each sensor, as in a replay.
+
+        The window begins again with a new start, and in an object that was loaded.
+        """
+        return [] if self._online is None else self._online.doubts(assumed=self._assumed)
 
     def _known_states(self) -> list[PyTree]:
         """States of the filter, the present one last; empty before the start."""

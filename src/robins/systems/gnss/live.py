@@ -28,9 +28,10 @@ from robins.errors import require
 from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilter
 from robins.filters.belief import FAILURES
 from robins.filters.machine import usual
+from robins.filters.online import WatchedStep
 from robins.filters.run import Step
 from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
-from robins.systems.gnss.model import RANGES, LocalFrame, MotionStep
+from robins.systems.gnss.model import LENGTH, RANGES, LocalFrame, MotionStep
 from robins.systems.gnss.parameters import GnssReplay
 from robins.systems.gnss.path import LEAST, GnssPath
 from robins.systems.streaming import (
@@ -76,11 +77,11 @@ def predicted(filter_: Filter, model: Model, state: FilterState, u: MotionStep) 
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
-def kept(step: Step) -> jax.Array:
+def kept(step: Step) -> WatchedStep:
     """The same after the pseudoranges of an epoch, and their code, NIS and number."""
     info = step.info[RANGES]
     outcome = [jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)]
-    return jnp.concatenate([_vector(step.posterior), jnp.stack(outcome)])
+    return WatchedStep.of(step, jnp.concatenate([_vector(step.posterior), jnp.stack(outcome)]))
 
 
 def _vector(belief: Belief) -> jax.Array:
@@ -128,6 +129,7 @@ class LiveGnss(Live):
     _parameters = GnssReplay
     _kept: ClassVar[tuple[str, ...]] = ("_last_step", "_frame")
     _parts: ClassVar[tuple[str, ...]] = ("_gate", "_path")
+    _assumed = (LENGTH,)
 
     def __init__(
         self,

@@ -36,9 +36,10 @@ from robins.errors import require
 from robins.filters import Belief, Code, Filter, FilterState, Model
 from robins.filters.kalman import WRONG
 from robins.filters.machine import usual
+from robins.filters.online import WatchedStep
 from robins.filters.run import Step
 from robins.ins.frames import turned
-from robins.systems.ins_gnss.log import SMOOTHED, contender
+from robins.systems.ins_gnss.log import ASSUMED, SMOOTHED, contender
 from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.path import InsGnssPath, row_of
 from robins.systems.ins_gnss.positions import attitudes
@@ -89,14 +90,14 @@ def _vector(belief: Belief) -> jax.Array:
     return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
 
 
-def kept(step: Step) -> jax.Array:
+def kept(step: Step) -> WatchedStep:
     """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
     last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
     seen = [
         jnp.stack([jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)])
         for _, info in sorted(step.info.items())
     ]
-    return jnp.concatenate([_vector(step.posterior), *seen, *last])
+    return WatchedStep.of(step, jnp.concatenate([_vector(step.posterior), *seen, *last]))
 
 
 def answer_of(
@@ -151,6 +152,7 @@ class LiveInsGnss(Live):
         "_past", "_counted", "_last_step", "start", "_begun_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
+    _assumed = ASSUMED
 
     def __init__(
         self,
@@ -370,13 +372,15 @@ class LiveInsGnss(Live):
         """Return to the last of the first `keep` epochs, or to before the start if 0."""
         if keep == len(self._past):
             return
-        self.counts["steps_again"] += len(self._past) - max(keep, 1)
+        steps = len(self._past) - max(keep, 1)
+        self.counts["steps_again"] += steps
         self.counts.subtract(chain(*self._counted[keep:]))
         self.counts = +self.counts  # drop counts that fell to zero
         del self._past[keep:], self._states[keep:], self._counted[keep:]
         assert self._online is not None
         if keep:
             self._online.state = self._states[-1]
+            self._online.forget(steps)
         else:
             self._online, self.start, self.epoch, self._last_step = None, "", None, None
             self._path.seek_again()

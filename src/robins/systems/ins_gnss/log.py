@@ -79,6 +79,7 @@ CAUSES = (
     "tells some of them."
 )
 WHEELS_S = 0.5  # longest interval of odometry over which the speed is interpolated
+ASSUMED = (model.STANDSTILL, model.STILL_RATE, model.ROAD)  # measurements of no device
 UNSURE_S = 2.0  # shortest doubt that is reported
 ROBUST, WEIGHED = "robust", "weighed"
 SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
@@ -445,7 +446,7 @@ def replay(
             sensors=model.SENSORS,
             estimates=_estimates,
             causes=CAUSES,
-            assumed=(model.STANDSTILL, model.STILL_RATE, model.ROAD),
+            assumed=ASSUMED,
         ),
         metrics=lambda answer: distances(log, used, epoch_s, antennas[answer.name]),
         variables=variables,

@@ -33,6 +33,7 @@ from robins.errors import require
 from robins.filters import Code
 from robins.filters.kalman import WRONG
 from robins.filters.machine import usual
+from robins.filters.online import WatchedStep
 from robins.filters.run import Step
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
@@ -87,8 +88,8 @@ class _Step(NamedTuple):
 _SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 1, 8])
 
 
-def _kept(step: Step) -> jax.Array:
-    """A `_Step` as one vector, so that compiled code returns a single array."""
+def _kept(step: Step) -> WatchedStep:
+    """A `_Step` as one vector."""
     mean, sigma, seen = kept(step)
     parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
     parts += [sigma, step.prediction.code[None]]
@@ -98,7 +99,7 @@ def _kept(step: Step) -> jax.Array:
         update = seen.get(name)
         code = [0.0, int(Code.MISSING)] if update is None else [update.dof, update.code]
         parts.append(jnp.stack([jnp.asarray(x, float) for x in code]))
-    return jnp.concatenate([jnp.asarray(part, float) for part in parts])
+    return WatchedStep.of(step, jnp.concatenate([jnp.asarray(part, float) for part in parts]))
 
 
 class LiveMarg(Live):
@@ -116,6 +117,7 @@ class LiveMarg(Live):
         "_marks", "_starting", "_open",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
+    _assumed = tuple(model.SENSORS)
 
     def __init__(
         self,
