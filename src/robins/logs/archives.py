@@ -33,6 +33,14 @@ _LARGEST = 1 << 30  # bytes, largest file
 _TEXT = "S40"  # type of time stamps, as in `robins.logs.text`
 _WIDEST = 64  # most columns of an array; images and point clouds are skipped
 _HEADER = 30  # bytes before the name of the first member of a zip archive
+_KINDS = {
+    "npz": "an archive of NumPy,",
+    "npy": "an array of NumPy,",
+    "hdf5": "an HDF5 file,",
+    "mat": "a MATLAB file,",
+    "parquet": "a Parquet file,",
+    "": "no archive, or one",
+}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -58,17 +66,18 @@ def names_in(path: str, changed_ns: int) -> frozenset[str]:
     """
     if kind_of_archive(read_beginning(path)) == "npz":
         data, _ = read_whole(path, _LARGEST)
-        members = archive_of(data, partial(_damaged, path, len(data))).namelist()
+        members = archive_of(data, partial(_damaged, path, "npz", len(data))).namelist()
         return frozenset(name.removesuffix(".npy") for name in members)
     return frozenset(arrays_in(path))
 
 
-def _damaged(path: str, size: int, why: str) -> LogError:
+def _damaged(path: str, kind: str, size: int, why: str) -> LogError:
     remedy = (
         "fetch it again, or save it as plain numbers; nothing of it was used, for no number in it "
         "can be trusted"
     )
-    return LogError(path, f"is cut short or damaged after {size} bytes: {why}", remedy)
+    what = f"is {_KINDS[kind]} cut short or damaged after {size} bytes: {why}"
+    return LogError(path, what, remedy)
 
 
 def arrays_in(path: AnyPath, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -83,8 +92,8 @@ def arrays_in(path: AnyPath, names: Collection[str] | None = None) -> dict[str, 
             read from a damaged one.
     """
     data, _ = read_whole(path, _LARGEST)
-    damaged = partial(_damaged, os.fspath(path), len(data))
     kind = kind_of_archive(data[:256])
+    damaged = partial(_damaged, os.fspath(path), kind, len(data))
     if kind == "npz":
         return arrays_of(data, damaged, names)
     if kind == "npy":
