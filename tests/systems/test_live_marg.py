@@ -107,6 +107,8 @@ def compare(log, live, least_us):
     np.testing.assert_array_equal((flags[ends[at]] & REST) > 0, still[at] > 0)
     refused = outcome.solution["magnetic_disturbance"].values[0]
     assert np.all(flags[ends[at]][refused[at] > 0] & Flag.DISTURBED)
+    doubted = [f"marg: {one}." for one in live.doubts()]
+    assert doubted == [one for one in outcome.warnings if one in doubted or "innovations of" in one]
     return outcome, answers
 
 
