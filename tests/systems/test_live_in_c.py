@@ -5,6 +5,7 @@ a filter that forgets does not let that grow with its steps.
 """
 
 import shutil
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -26,7 +27,9 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C co
 def quick(monkeypatch):
     """Compile without optimisation; the bits are the same."""
     flags = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
-    monkeypatch.setattr("robins.program.native.build", lambda text, _: build(text, flags))
+    # the name of this module is also that of a function of the package
+    module = import_module("robins.program.native")
+    monkeypatch.setattr(module, "build", lambda text, _: build(text, flags))
 
 
 def test_the_orientation_is_that_by_jax():
