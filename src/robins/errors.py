@@ -96,11 +96,10 @@ MOVED: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "robins.bench.rig": {
         old: ("robins.bench.evaluation", name)
-        for old, name in {
-            **{name: name for name in ("Alarms", "Offer")},
-            **{"Judged": "RunFigures", "Spoken": "OperatorEvent"},
-            **{"Told": "Alert", "View": "PageView"},
-        }.items()
+        for old, name in (
+            *(("Alarms", "Alarms"), ("Offer", "Offer"), ("Judged", "RunFigures")),
+            *(("Spoken", "OperatorEvent"), ("Told", "Alert"), ("View", "PageView")),
+        )
     },
     "robins.systems.marg": {
         "first_look": ("robins.systems.marg", "initial_alignment"),
@@ -109,24 +108,12 @@ MOVED: dict[str, dict[str, tuple[str, ...]]] = {
         "causal_attitudes": ("robins.systems.marg.model", "causal_attitudes"),
         "smoothed_attitudes": ("robins.systems.marg.model", "smoothed_attitudes"),
     },
-    "robins.systems.gnss": {
-        "Replay": ("robins.systems.gnss", "GnssReplay"),
-    },
-    "robins.systems.ins_gnss": {
-        "Replay": ("robins.systems.ins_gnss", "InsGnssReplay"),
-    },
-    "robins.cli": {
-        "Status": ("robins.cli", "ExitStatus"),
-    },
-    "robins.bench.ports": {
-        "Line": ("robins.bench.ports", "SerialLine"),
-    },
-    "robins.bench.live": {
-        "Live": ("robins.bench.live", "LivePage"),
-    },
-    "robins.sim": {
-        "Motion": ("robins.sim", "MotionProfile"),
-    },
+    "robins.systems.gnss": {"Replay": ("robins.systems.gnss", "GnssReplay")},
+    "robins.systems.ins_gnss": {"Replay": ("robins.systems.ins_gnss", "InsGnssReplay")},
+    "robins.cli": {"Status": ("robins.cli", "ExitStatus")},
+    "robins.bench.ports": {"Line": ("robins.bench.ports", "SerialLine")},
+    "robins.bench.live": {"Live": ("robins.bench.live", "LivePage")},
+    "robins.sim": {"Motion": ("robins.sim", "MotionProfile")},
     "robins.bench.broker": {
         "Table": ("robins.bench.broker", "FaultTable"),
         "Said": ("robins.bench.broker", "DeviceFault"),
@@ -136,12 +123,8 @@ MOVED: dict[str, dict[str, tuple[str, ...]]] = {
         "Judged": ("robins.bench", "RunFigures"),
         "View": ("robins.bench", "PageView"),
     },
-    "robins.bench.run": {
-        "Ran": ("robins.bench.run", "RunResult"),
-    },
-    "robins.report": {
-        "Origin": ("robins.report", "ReportOrigin"),
-    },
+    "robins.bench.run": {"Ran": ("robins.bench.run", "RunResult")},
+    "robins.report": {"Origin": ("robins.report", "ReportOrigin")},
     "robins.results": {
         "keeping": ("robins.results", "keep_on_error"),
         "silent": ("robins.results", "ignore_progress"),
