@@ -15,6 +15,7 @@ from rich.text import Text
 
 from robins.report import series, style
 from robins.report.numbers import show, words
+from robins.report.series import Series
 from robins.report.style import Picture
 from robins.results import find
 
@@ -28,34 +29,27 @@ _COLUMNS = 500  # columns of the information map
 _FULL = 10.0  # bits at the end of the colour scale, a thousandth of the prior
 
 
-class BoundLine(NamedTuple):
-    """A bound in the unit of figures."""
-
-    values: np.ndarray  # (..., time, axis), or (axis,) of the prior
-    unit: str
-    x: np.ndarray  # (time,) s
-
-
 _ROLES = ("bound", "bound_prior", "bound_unaided", "bound_without")
 
 
-def line(solution: xr.Dataset, block: str, role: str = "bound") -> BoundLine:
-    """The bound of a block, one standard deviation.
+def line(solution: xr.Dataset, block: str, role: str = "bound") -> Series:
+    """The bound of a block (..., time, axis), one standard deviation; of the prior (axis,).
 
     Raises:
         KeyError: the solution has no such bound.
     """
     array = find(solution, role)[block]
     x = series.x_of(array, array.ndim - 2) if array.ndim > 1 else np.zeros(0)
-    return BoundLine(*series.shown(array), x)
+    values, unit = series.shown(array)
+    return Series(unit, values, x, series.coordinate(solution, array.dims[-1]), array.attrs)
 
 
-def comparison_bound(solution: xr.Dataset, block: str) -> BoundLine | None:
+def comparison_bound(solution: xr.Dataset, block: str) -> Series | None:
     """The bound to draw with the filters; None if the solution has none."""
     return line(solution, block) if block in find(solution, "bound") else None
 
 
-def draw(axes: Axes, bound: BoundLine, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
+def draw(axes: Axes, bound: Series, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
     """Draw a multiple of the bound of an axis with the filters; returns it."""
     y = times * bound.values[:, k]
     axes.plot(*series.thin(bound.x / seconds, y), zorder=4, **_LOOK)
@@ -82,8 +76,8 @@ def sensors(solution: xr.Dataset) -> list[str]:
 def sigmas(solution: xr.Dataset, block: str) -> Picture:
     """The bound of a block over time, with all sensors, without each, and with none."""
     every, _, unaided, without = (line(solution, block, role) for role in _ROLES)
-    names, labels = sensors(solution), series.coordinate(solution, f"axis_{block}")
-    figure, stack, clock = series.stacked(solution, every.x, labels, every.unit)
+    names = sensors(solution)
+    figure, stack, clock = series.stacked(solution, every)
     for k, axes in enumerate(stack):
         lines = [(unaided.values[:, k], _NONE)]
         for i, one in enumerate(without.values[: len(names)], 1):
@@ -103,9 +97,8 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
         "way between the line without it and the line with all. Lines that run away leave the "
         "figure."
     )
-    frame = find(solution, "bound")[block].attrs["frame"]
-    caption += f" Frame: {frame}."
-    return Picture(f"bound_{block}", f"Covariance bound of the {words(block)}", caption, figure)
+    title = f"Covariance bound of the {words(block)}"
+    return Picture(f"bound_{block}", title, caption + every.frame, figure)
 
 
 def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarray) -> None:
@@ -203,7 +196,7 @@ def rows(solution: xr.Dataset, at: Sequence[int]) -> list[BoundRow]:
     for block in blocks(solution):
         start = np.asarray(find(solution, "bound_left")[block], float)
         every, prior, unaided, without = (line(solution, block, role) for role in _ROLES)
-        for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
+        for k, axis in enumerate(every.axes):
             sigma, least = every.values[list(at), k].tolist(), float(unaided.values[at[-1], k])
             others = without.values[: len(names), at[-1], k].tolist()
             known = f"{words(block)} {axis}", every.unit, float(prior.values[k])

@@ -14,7 +14,6 @@ from robins.report.style import Picture
 from robins.results import Probability, find
 
 _MOST = 12  # charts of one figure
-_COLUMNS = 3
 _NO_ERRORS = ("nis_", "refused_", "rest_share", "log_likelihood")  # no comparison by themselves
 
 
@@ -41,9 +40,7 @@ def comparison(summary: Summary) -> Picture | None:
     found = dict(list(metrics(summary["filters"]).items())[:_MOST])
     if all(name.startswith(_NO_ERRORS) for name in found):
         return None
-    columns = min(_COLUMNS, len(found))
-    rows = -(-len(found) // columns)
-    figure, grid = style.new_figure(rows, columns, 0.5 + rows * (0.5 + 0.24 * len(filters)))
+    figure, grid = style.panels(len(found), 0.5, 0.5 + 0.24 * len(filters))
     engine: Any = figure.get_layout_engine()
     engine.set(wspace=0.07, hspace=0.06)  # otherwise tick labels of adjacent axes touch
     places, uncertain = range(len(filters)), False
@@ -66,11 +63,8 @@ def comparison(summary: Summary) -> Picture | None:
         axes.locator_params(axis="x", nbins=3)
         axes.spines["left"].set_visible(False)
         axes.set_title(str(numbers.label(name)))
-    for number, axes in enumerate(grid.flat):
-        if number % columns:
-            axes.set_yticklabels([])
-        if number >= len(found):
-            axes.set_visible(False)
+    for axes in grid[:, 1:].flat:
+        axes.set_yticklabels([])
     caption = "The filters on the same data. Each chart has its own scale, which begins at zero."
     if uncertain:
         caption += " A line over a bar is the 95\u00a0% interval of a probability."

@@ -26,8 +26,7 @@ _WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
 @style.styled
 def within(solution: xr.Dataset, limit: str) -> Picture:
     """Share of the runs of a campaign whose error is within a limit, over time."""
-    data = series.get(solution, "within", limit)
-    assert data is not None
+    data = series.required(solution, "within", limit)
     filters = series.filters(solution)
     runs = int(data.attrs.get("runs", 0))
     tinted = runs > 1 and len(filters) <= style.TINTED
@@ -112,25 +111,31 @@ _BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
 _STEEP = 3.0  # a start this many times higher than the rest is cut off, with a remark
 
 
-def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
-    """Scale to the time after the start if the start is far higher; True if that cuts it off.
+def _scale(
+    axes: Axes, x: np.ndarray, lines: list[np.ndarray], errors: np.ndarray, centred: bool = True
+) -> None:
+    """Scale to the time after the start if the start is far higher, with a remark.
 
-    Only the start is cut off: a later divergence must stay visible.
+    Only the start is cut off: a later divergence must stay visible. A stated sigma far above all
+    errors leaves the figure.
     """
-    if x.size == 0:
-        return False
-    values = np.abs(np.stack(lines))
+    kept = _in_scale(lines, errors)
+    values = np.abs(np.stack(kept))
     values = np.where(np.isfinite(values), values, 0.0)
-    most, later = values.max(), values[:, x > x[0] + _START * (x[-1] - x[0])].max(initial=0.0)
-    if later == 0.0 or most < _STEEP * later:
-        return False
-    top = 1.25 * later
-    axes.set_ylim(-top if centred else -0.02 * top, top)
-    box = {"facecolor": "white", "edgecolor": style.GREY, "linewidth": 0.5, "pad": 2.0}
-    look: dict[str, Any] = {"va": "top", "fontsize": 8.0, "color": style.TRUTH, "zorder": 6}
-    text, place = f"starts at {most:.3g}", (0.006, 0.95)
-    axes.annotate(text, place, xycoords="axes fraction", bbox=box, **look)
-    return True
+    after = x > x[:1] + _START * (x[-1:] - x[:1])
+    most, later = values.max(initial=0.0), values[:, after].max(initial=0.0)
+    steep = later > 0.0 and most >= _STEEP * later
+    if steep or len(kept) < len(lines):
+        top = 1.25 * (later if steep else most) or 1.0
+        bottom = -0.02 * top if steep else 0.0
+        axes.set_ylim(-top if centred else bottom, top)
+    elif not centred:
+        axes.set_ylim(bottom=0.0)
+    if steep:
+        box = {"facecolor": "white", "edgecolor": style.GREY, "linewidth": 0.5, "pad": 2.0}
+        look: dict[str, Any] = {"va": "top", "fontsize": 8.0, "color": style.TRUTH, "zorder": 6}
+        text, place = f"starts at {most:.3g}", (0.006, 0.95)
+        axes.annotate(text, place, xycoords="axes fraction", bbox=box, **look)
 
 
 def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
@@ -145,30 +150,18 @@ def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
     return kept or lines
 
 
-def _top(lines: list[np.ndarray]) -> float:
-    """Half the height of axes that include the finite values of the lines."""
-    values = np.abs(np.stack(lines))
-    return 1.25 * float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
-
-
 def _or_bound(solution: xr.Dataset) -> str:
     return "; of H-infinity a bound, not a covariance" if bound_names(solution) else ""
-
-
-def _keys(filters: list[str], solution: xr.Dataset, *more) -> list:
-    keys = [*style.filter_keys(filters), *more]
-    return [*keys, style.outage_key()] if series.outage(solution) else keys
 
 
 @style.styled
 def errors(solution: xr.Dataset, block: str) -> Picture:
     """Estimation errors of a block of the state within the three sigma the filters state."""
-    error = series.get(solution, "error", block)
-    assert error is not None
+    error = series.required(solution, "error", block)
     sigma = series.get(solution, "sigma", block)
     best = bounds.comparison_bound(solution, block)
     filters = series.filters(solution)
-    figure, stack, clock = series.stacked(solution, error.x, error.axes, error.unit)
+    figure, stack, clock = series.stacked(solution, error)
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
@@ -180,14 +173,11 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
         if best is not None:
             lines += [bounds.draw(axes, best, k, clock.seconds, times) for times in (3.0, -3.0)]
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-        kept = _in_scale(lines, error.values[:, :, k])
-        if not _limit(axes, error.x, kept) and len(kept) < len(lines):
-            top = _top(kept)
-            axes.set_ylim(-top, top)
+        _scale(axes, error.x, lines, error.values[:, :, k])
     label = f"±3σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
     more += [bounds.key("±3σ ")] if best is not None else []
-    style.legend(figure, _keys(filters, solution, *more))
+    series.legend(figure, solution, [*style.filter_keys(filters), *more])
     name = words(block)
     caption = error.attrs.get("comment", "True minus estimated.")
     if sigma is not None:
@@ -220,11 +210,10 @@ def _envelope(
 @style.styled
 def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Picture:
     """Estimates of a block of the state, within three sigma: biases, or a path without truth."""
-    found = series.get(solution, role, block)
-    assert found is not None
+    found = series.required(solution, role, block)
     sigma = series.get(solution, "sigma", block)
     filters = series.filters(solution)
-    figure, stack, clock = series.stacked(solution, found.x, found.axes, found.unit)
+    figure, stack, clock = series.stacked(solution, found)
     turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(found.unit)
     for k, axes in enumerate(stack):
         for i in range(len(filters)):
@@ -237,7 +226,7 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
             _window(axes, found.values[:, :, k], 3.0 * sigma.values[:, :, k])
     thin_lines = sigma is not None and turn is None
     more = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if thin_lines else []
-    style.legend(figure, _keys(filters, solution, *more))
+    series.legend(figure, solution, [*style.filter_keys(filters), *more])
     name = words(block)
     caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
     caption += found.attrs.get("comment", "") + found.frame
@@ -276,15 +265,14 @@ def _window(axes: Axes, values: np.ndarray, reach: np.ndarray) -> None:
 @style.styled
 def campaign(solution: xr.Dataset, block: str) -> Picture:
     """Scatter of the runs of a campaign against the sigma the filters state."""
-    rms = series.get(solution, "rms", block)
-    assert rms is not None
+    rms = series.required(solution, "rms", block)
     stated = series.get(solution, "mean_sigma", block)
     best = bounds.comparison_bound(solution, block)
     filters = series.filters(solution)
     few = len(filters) <= style.TINTED
     mean = series.get(solution, "mean_error", block) if few else None
     runs = int(rms.attrs.get("runs", 0))
-    figure, stack, clock = series.stacked(solution, rms.x, rms.axes, rms.unit)
+    figure, stack, clock = series.stacked(solution, rms)
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
@@ -304,9 +292,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
                 axes.plot(x, y, color=style.colour(i), linestyle=":", linewidth=0.8, zorder=2)
         if best is not None:
             lines.append(bounds.draw(axes, best, k, clock.seconds))
-        kept = _in_scale(lines, rms.values[:, :, k])
-        if not _limit(axes, rms.x, kept, centred=False):
-            axes.set_ylim(0.0, None if len(kept) == len(lines) else _top(kept))
+        _scale(axes, rms.x, lines, rms.values[:, :, k], centred=False)
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     dots = {"color": style.GREY, "linestyle": ":", "linewidth": 0.8}
@@ -315,7 +301,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
         more += [style.key("95\u00a0% of the RMS if σ is true", **tint)]
     more += [style.key("|mean error|", **dots)] if mean is not None else []
     more += [bounds.key()] if best is not None else []
-    style.legend(figure, _keys(filters, solution, *more))
+    series.legend(figure, solution, [*style.filter_keys(filters), *more])
     name = words(block)
     caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
     if stated is not None and runs:
@@ -355,5 +341,5 @@ def height(solution: xr.Dataset) -> Picture | None:
         more.append(style.key("reference", **look))
     for i in range(len(filters)):
         clock.plot(axes, data.x, data.values[i, :, 0], **style.filter_look(i))
-    style.legend(figure, _keys(filters, solution, *more))
+    series.legend(figure, solution, [*style.filter_keys(filters), *more])
     return Picture("height", "Height profile", "Height above the WGS-84 ellipsoid.", figure)

@@ -141,16 +141,14 @@ def _claims(claims: Sequence[Claim]) -> str:
 
 def _frame(picture: Picture) -> str:
     """HTML of a picture without its source."""
-    return _figure(Embedded(picture, "", 99999, 99999)) + "\n" + " " * 80
+    return _figure(picture, "", 99999, 99999) + "\n" + " " * 80
 
 
-def _figure(shown: Embedded) -> str:
-    picture = shown.picture
+def _figure(picture: Picture, source: str, width: int, height: int) -> str:
     head = f"<h3>{escape(picture.title)}</h3>{escape(picture.caption)}"
-    if shown.source:
+    if source:
         image = (
-            f'<img src="{shown.source}" width="{shown.width}" height="{shown.height}" '
-            f'alt="{escape(picture.title)}">'
+            f'<img src="{source}" width="{width}" height="{height}" alt="{escape(picture.title)}">'
         )
     else:
         name = escape(f"figures/{picture.name}.png")
@@ -161,7 +159,8 @@ def _figure(shown: Embedded) -> str:
 def _figures(shown: Sequence[Embedded]) -> str:
     if not shown:
         return ""
-    return "<section>\n<h2>Figures</h2>\n" + "\n".join(map(_figure, shown)) + "\n</section>"
+    each = (_figure(one.picture, one.source, one.width, one.height) for one in shown)
+    return "<section>\n<h2>Figures</h2>\n" + "\n".join(each) + "\n</section>"
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -51,15 +51,6 @@ class RenderedPicture(NamedTuple):
         return width, height
 
 
-class Embedded(NamedTuple):
-    """A picture as the source of an image; empty if there was no room for it."""
-
-    picture: Picture
-    source: str
-    width: int  # of the drawing, for the page's layout
-    height: int
-
-
 def dpi_for(pictures: int) -> int:
     """Dots per inch at which each of so many pictures of a page is drawn."""
     return DPI if pictures <= _FEW else PAGE_DPI
@@ -153,16 +144,20 @@ def _svg_source(content: bytes) -> str:
     return "data:image/svg+xml," + quote(flat, safe=" /:=;,.-+()'!*@?_~<>")
 
 
-class _PictureForms:
-    """The forms of one picture, each made only when it is needed.
+class Embedded:
+    """A picture as the source of an image, in one of its forms, made only when it is needed.
 
     Attributes:
-        source: the current form.
-        rung: its place on the ladder of forms, from fine to coarse.
+        picture: that is embedded.
+        source: the current form; empty if there was no room for it.
+        width: of the drawing, for the page's layout.
+        height: likewise.
+        rung: place of the form on the ladder, from fine to coarse.
     """
 
     def __init__(self, drawn: RenderedPicture):
-        self.drawn, self.rung = drawn, 0
+        self.picture, self._dots, self.rung = drawn.picture, drawn.dots, 0
+        self.width, self.height = drawn.pixels
         self._sources: dict[int, str] = {}
         self.source = self._form(0)
         if _points(drawn.picture.figure) <= _SIMPLE:
@@ -177,7 +172,7 @@ class _PictureForms:
     def _form(self, rung: int) -> str:
         if rung not in self._sources:
             share, colours, effort, _ = _LADDER[rung]
-            made = packed(shrunk(self.drawn.dots, share), colours, effort)
+            made = packed(shrunk(self._dots, share), colours, effort)
             self._sources[rung] = "data:image/png;base64," + base64.b64encode(made).decode()
         return self._sources[rung]
 
@@ -202,7 +197,7 @@ def _steps(sizes: Sequence[int], limit: int) -> list[int]:
     return rungs
 
 
-def _refine(choices: Sequence[_PictureForms], limit: int) -> None:
+def _refine(choices: Sequence[Embedded], limit: int) -> None:
     """Take finer forms, the smallest picture first, as long as all fit."""
     left = [c for c in choices if c.rung]
     while left and sum(c.size for c in choices) < _SLACK * limit:
@@ -220,7 +215,7 @@ def embed(drawn: Sequence[RenderedPicture], limit: int) -> list[Embedded]:
 
     The largest is made coarser until all fit; pictures are left out only in their coarsest form.
     """
-    choices = [_PictureForms(one) for one in drawn]
+    choices = list(map(Embedded, drawn))
     for choice, rung in zip(choices, _steps([c.size for c in choices], limit), strict=True):
         choice.take(rung)
     _refine(choices, limit)
@@ -230,4 +225,4 @@ def embed(drawn: Sequence[RenderedPicture], limit: int) -> list[Embedded]:
             one.take(one.rung + 1)
         else:
             max(choices, key=lambda c: c.size).source = ""
-    return [Embedded(c.drawn.picture, c.source, *c.drawn.pixels) for c in choices]
+    return choices

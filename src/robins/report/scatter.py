@@ -15,8 +15,7 @@ _WHOLE = 100  # runs below which the highest percentile is the largest of them
 @style.styled
 def percentiles(solution: xr.Dataset, block: str) -> Picture:
     """Median, the middle nine tenths, and the highest percentile of the length of an error."""
-    data = series.get(solution, "percentile", block)
-    assert data is not None
+    data = series.required(solution, "percentile", block)
     filters = series.filters(solution)
     tinted = len(filters) <= style.TINTED
     label = f"length of the error [{data.unit}]" if data.unit else "length of the error"

@@ -19,7 +19,6 @@ from robins.report.numbers import csv_of, words
 from robins.report.style import Picture
 from robins.results import find
 
-_COLUMNS = 3  # blocks side by side
 _ORDERS = {"first": "first order: alone", "total": "total: with others"}
 _SLICES, _FEW = 10, 8  # means over a parameter: number of slices, and least points in each
 _WIDE = 0.2  # width of a confidence interval above which the ranking is doubted
@@ -32,18 +31,11 @@ def budget(solution: xr.Dataset) -> Picture:
     """First-order and total indices of each block, with their 95 % bounds."""
     blocks = find(solution, "sobol_first")
     names = series.coordinate(solution, "parameter")
-    columns = min(_COLUMNS, len(blocks))
-    rows = -(-len(blocks) // columns)
-    height = 0.9 + rows * (0.55 + 0.42 * len(names))
-    figure, grid = style.new_figure(rows, columns, height, sharex=True, sharey=True)
-    for number, axes in enumerate(grid.flat):
-        axes.set_visible(number < len(blocks))
-    for number, (axes, block) in enumerate(zip(grid.flat, blocks, strict=False)):
+    each, share = 0.55 + 0.42 * len(names), "share of the variance"
+    figure, grid = style.panels(len(blocks), 0.9, each, share, sharex=True, sharey=True)
+    for axes, block in zip(grid.flat, blocks, strict=False):
         _bars(axes, solution, block)
         axes.set_title(words(block))
-        if number + columns >= len(blocks):
-            axes.set_xlabel("share of the variance")
-            axes.tick_params(labelbottom=True)
     grid[0, 0].set_yticks(range(len(names)), names)
     grid[0, 0].invert_yaxis()
     keys: list[Any] = [
@@ -68,14 +60,9 @@ def scatter(solution: xr.Dataset, block: str) -> Picture:
     rms, unit = series.shown(find(solution, "sobol_rms")[block])
     share = find(solution, "sobol_share")[""]
     names = series.coordinate(solution, "parameter")
-    ends = [text.split(" to ") for text in share.attrs["ends"].split("; ")]
-    columns = min(_COLUMNS, len(names))
-    rows = -(-len(names) // columns)
-    figure, grid = style.new_figure(rows, columns, 0.3 + 2.2 * rows, sharey=True)
-    for number, axes in enumerate(grid.flat):
-        axes.set_visible(number < len(names))
-        if number % columns == 0:
-            axes.set_ylabel(f"{words(block)} RMS [{unit}]" if unit else f"{words(block)} RMS")
+    ends = _ends(solution)
+    label = f"{words(block)} RMS [{unit}]" if unit else f"{words(block)} RMS"
+    figure, grid = style.panels(len(names), 0.3, 2.2, y=label, sharey=True)
     slices = max(2, min(_SLICES, count // _FEW))
     for k, (axes, name) in enumerate(zip(grid.flat, names, strict=False)):
         x, y = np.asarray(share, float)[:count, k], rms[:count]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from robins import units
 from robins.report import style
@@ -33,7 +36,7 @@ class TimeUnit(NamedTuple):
 
 
 class Series(NamedTuple):
-    """An array over filters, time and perhaps axes, in the unit of figures."""
+    """An array over filters, time and perhaps axes, or a bound, in the unit of figures."""
 
     unit: str
     values: np.ndarray  # (filter, time, axis)
@@ -65,9 +68,16 @@ def shown(array: xr.DataArray) -> tuple[np.ndarray, str]:
 
 def get(solution: xr.Dataset, role: str, of: str = "") -> Series | None:
     """The array of a role as a `Series`, in the unit of figures; None if there is none."""
-    array = one(solution, role, of)
-    if array is None:
-        return None
+    return required(solution, role, of) if of in find(solution, role) else None
+
+
+def required(solution: xr.Dataset, role: str, of: str = "") -> Series:
+    """The array of a role as a `Series`, in the unit of figures.
+
+    Raises:
+        KeyError: there is none.
+    """
+    array = find(solution, role)[of]
     values, unit = shown(array)
     axes = coordinate(solution, array.dims[2]) if array.ndim > 2 else [""]
     values = values if array.ndim > 2 else values[..., None]
@@ -116,23 +126,28 @@ def single_axes(
 
 
 def stacked(
-    solution: xr.Dataset, x: np.ndarray, axes: list[str], unit: str, more: int = 0
+    solution: xr.Dataset, data: Series, more: int = 0
 ) -> tuple[Figure, np.ndarray, TimeUnit]:
     """A figure of one pair of axes over time for each component, outages shaded.
 
     ``more`` pairs are added below. Components of different units state their own.
     """
-    rows = len(axes) + more
+    rows = len(data.axes) + more
     figure, grid = style.new_figure(rows, 1, 0.9 + 1.35 * rows, sharex=True)
-    stack, time = grid[:, 0], clock(x)
+    stack, time = grid[:, 0], clock(data.x)
     for one in stack:
         time.shade(one, solution)
         one.margins(x=0.0)
-    for one, label in zip(stack, axes, strict=False):
-        one.set_ylabel(f"{label} [{unit}]" if unit and "[" not in label else label)
+    for one, label in zip(stack, data.axes, strict=False):
+        one.set_ylabel(f"{label} [{data.unit}]" if data.unit and "[" not in label else label)
     stack[-1].set_xlabel(time.label)
     figure.align_ylabels()
     return figure, stack, time
+
+
+def legend(figure: Figure, solution: xr.Dataset, keys: Sequence[Line2D | Patch]) -> None:
+    """One legend above all axes, with the outages where there are any."""
+    style.legend(figure, [*keys, style.outage_key()] if outage(solution) else keys)
 
 
 def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:

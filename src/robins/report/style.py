@@ -24,6 +24,7 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
 TINTED = 4  # filters whose tints can be distinguished
+_COLUMNS = 3  # panels side by side
 _ROWS = 2  # rows of a legend that fit every figure
 _REMARK = 100  # characters in a line of a remark
 TRUTH = "#222222"
@@ -86,6 +87,40 @@ def new_figure(
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
+
+
+def panels(
+    count: int,
+    base: float,
+    each: float,
+    x: str = "",
+    y: str = "",
+    *,
+    sharex: bool = False,
+    sharey: bool = False,
+) -> tuple[Figure, np.ndarray]:
+    """A figure of so many pairs of axes, three to a row; those left over are hidden.
+
+    Args:
+        count: of the axes.
+        base: height without rows, in inches.
+        each: height of a row.
+        x: label of the lowest axes of each column.
+        y: label of the first axes of each row.
+        sharex: all axes have one scale along x.
+        sharey: likewise along y.
+    """
+    columns = min(_COLUMNS, count)
+    rows = -(-count // columns)
+    figure, grid = new_figure(rows, columns, base + rows * each, sharex=sharex, sharey=sharey)
+    for number, axes in enumerate(grid.flat):
+        axes.set_visible(number < count)
+        if number % columns == 0:
+            axes.set_ylabel(y)
+        if number + columns >= count:
+            axes.set_xlabel(x)
+            axes.tick_params(labelbottom=True)
+    return figure, grid
 
 
 def colour(index: int) -> str:

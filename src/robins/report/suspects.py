@@ -16,9 +16,8 @@ _VISIBLE = 0.01  # probability below which a line lies on zero
 @style.styled
 def suspects(solution: xr.Dataset) -> Picture | None:
     """Fault probability by suspect over time; None if there is none above zero."""
-    first, mean = (series.get(solution, role) for role in ("wrong", "mean_wrong"))
+    first, mean = series.required(solution, "wrong"), series.get(solution, "mean_wrong")
     true = series.one(solution, "truly_wrong")
-    assert first is not None
     names = [name.replace("_", " ") for name in first.axes]
     filters = series.filters(solution)
     stating = [i for i in range(len(filters)) if np.isfinite(first.values[i]).any()]
@@ -26,7 +25,7 @@ def suspects(solution: xr.Dataset) -> Picture | None:
     suspected = any(np.nanmax(values, initial=0.0) > _VISIBLE for values in shown)
     if not suspected and (true is None or not np.any(true)):
         return None
-    figure, stack, clock = series.stacked(solution, first.x, names, "")
+    figure, stack, clock = series.stacked(solution, first._replace(axes=names))
     for k, axes in enumerate(stack):
         if true is not None:
             style.shade(axes, first.x / clock.seconds, np.asarray(true)[:, k] != 0, style.BAND)
@@ -39,7 +38,7 @@ def suspects(solution: xr.Dataset) -> Picture | None:
     keys: list[Line2D | Patch] = [style.filter_keys(filters)[i] for i in stating]
     if true is not None and np.any(true):
         keys.append(Patch(color=style.BAND, label="truly wrong"))
-    style.legend(figure, [*keys, *([style.outage_key()] if series.outage(solution) else [])])
+    series.legend(figure, solution, keys)
     caption = "Probability that it is wrong, as the hypotheses of the filter state it at each step."
     if mean is not None:
         caption += f" Mean over {mean.attrs['runs']} runs; thin: the first run."

@@ -12,8 +12,8 @@ from matplotlib.colors import LogNorm, Normalize
 from robins.report import series, style
 from robins.report.numbers import words
 from robins.report.style import Picture
+from robins.results import find
 
-_COLUMNS = 3
 _DECADE = 8.0  # ratio of greatest to least error from which the colours are logarithmic
 
 
@@ -45,10 +45,8 @@ def _unit(block: str, unit: str) -> str:
 @style.styled
 def curves(solution: xr.Dataset, block: str) -> Picture:
     """RMS error of each filter over a parameter, with 95 % bounds, and its stated sigma."""
-    arrays = (series.one(solution, f"sweep_{k}", block) for k in ("rms", "low", "high", "stated"))
-    (rms, unit), (low, _), (high, _), (stated, _) = (
-        series.shown(one) for one in arrays if one is not None
-    )
+    arrays = [find(solution, f"sweep_{k}")[block] for k in ("rms", "low", "high", "stated")]
+    (rms, unit), (low, _), (high, _), (stated, _) = map(series.shown, arrays)
     places, tick_labels, label = _axis(solution, "sweep_1")
     filters = series.filters(solution)
     figure, grid = style.new_figure(1, 1, 3.0)
@@ -71,9 +69,9 @@ def curves(solution: xr.Dataset, block: str) -> Picture:
     axes.set(xlabel=label, ylabel=_unit(block, unit))
     keys = [*style.filter_keys(filters), style.key("stated", color=style.GREY, linestyle=":")]
     style.legend(figure, keys)
-    runs = series.one(solution, "sweep_rms", block).attrs["runs"]  # type: ignore[union-attr]
+    runs = int(arrays[0].attrs["runs"])
     caption = (
-        f"Length of the error over its components, RMS over {int(runs)} runs and the epochs that "
+        f"Length of the error over its components, RMS over {runs} runs and the epochs that "
         "count. Bands: 95 % confidence, by the spread of the runs. Dotted: the standard deviation "
         "that the filter states. All points have the same random numbers."
     )
@@ -83,16 +81,12 @@ def curves(solution: xr.Dataset, block: str) -> Picture:
 @style.styled
 def maps(solution: xr.Dataset, block: str) -> Picture:
     """RMS error of each filter over two parameters, printed in each cell."""
-    array = series.one(solution, "sweep_rms", block)
-    assert array is not None
+    array = find(solution, "sweep_rms")[block]
     rms, unit = series.shown(array)
     (_, along, label), (_, up, other) = (_axis(solution, f"sweep_{k}") for k in (1, 2))
     filters = series.filters(solution)
-    columns = min(_COLUMNS, len(filters))
-    rows = -(-len(filters) // columns)
-    figure, grid = style.new_figure(
-        rows, columns, 0.9 + rows * (0.6 + 0.26 * len(up)), sharex=True, sharey=True
-    )
+    each = 0.6 + 0.26 * len(up)
+    figure, grid = style.panels(len(filters), 0.9, each, label, other, sharex=True, sharey=True)
     finite = rms[np.isfinite(rms)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     wide = low > 0.0 and high > _DECADE * low
@@ -111,13 +105,6 @@ def maps(solution: xr.Dataset, block: str) -> Picture:
         axes.set_yticks(range(len(up)), up)
         for side in axes.spines.values():
             side.set_visible(False)
-    for number, axes in enumerate(grid.flat):
-        axes.set_visible(number < len(filters))
-        if number % columns == 0:
-            axes.set_ylabel(other)
-        if number + columns >= len(filters):
-            axes.set_xlabel(label)
-            axes.tick_params(labelbottom=True)
     if image is not None:
         bar = figure.colorbar(image, ax=grid, label=_unit(block, unit), shrink=0.9, pad=0.02)
         if wide:  # otherwise labels between powers of ten are written as products

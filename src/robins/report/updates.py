@@ -15,6 +15,7 @@ from scipy.special import gammaincinv
 from robins.report import series, style
 from robins.report.numbers import words
 from robins.report.style import Picture
+from robins.results import find
 
 
 def quantile(probability: float, degrees: Any) -> np.ndarray:
@@ -78,13 +79,11 @@ _STEEP = 15.0  # ratio of a statistic to its band from which the axis is logarit
 @style.styled
 def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     """Innovations of a sensor and, below them, their normalised square."""
-    data = series.get(solution, "innovation", sensor)
-    assert data is not None
+    data = series.required(solution, "innovation", sensor)
     sigma = series.get(solution, "innovation_sigma", sensor)
     nis = series.one(solution, "nis", sensor)
     filters = series.filters(solution)
-    told = data.x, data.axes, data.unit
-    figure, stack, clock = series.stacked(solution, *told, more=int(nis is not None))
+    figure, stack, clock = series.stacked(solution, data, more=int(nis is not None))
     x = data.x / clock.seconds
     refused = _refused(solution, sensor, data.values.shape[:2])
     present = [i for i in range(len(filters)) if np.isfinite(data.values[i]).any()]
@@ -115,9 +114,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
         stack[-1].set_ylabel("NIS")
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
         style.remark(stack[-1], shares)
-    if series.outage(solution):
-        keys.append(style.outage_key())
-    style.legend(figure, keys)
+    series.legend(figure, solution, keys)
     name = words(sensor)
     caption = (
         "Measured minus predicted. They should look like white noise "
@@ -221,8 +218,7 @@ def _statistic(
 @style.styled
 def consistency(solution: xr.Dataset, name: str) -> Picture:
     """NEES of a run, or its average over the runs of a campaign, in its chi-square band."""
-    array = series.one(solution, "consistency", name)
-    assert array is not None
+    array = find(solution, "consistency")[name]
     figure, axes, clock = series.single_axes(solution, series.x_of(array, 1), name.upper())
     limits = band(array, series.one(solution, "consistency_dof", name))
     filters = series.filters(solution)
@@ -235,7 +231,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
         if np.isfinite(limits.expected):
             axes.axhline(limits.expected, color=style.GREY, linewidth=0.7, zorder=1)
     style.remark(axes, shares)
-    style.legend(figure, [*keys, style.outage_key()] if series.outage(solution) else keys)
+    series.legend(figure, solution, keys)
     runs = array.attrs.get("runs")
     caption = "Squared estimation error, normalised by the stated covariance"
     caption += f", mean of {int(runs)} runs." if runs else "."
