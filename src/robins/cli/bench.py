@@ -49,8 +49,8 @@ from robins.cli.options import (
     RESULTS,
     SETTINGS,
     TRUST,
+    add_examples,
     answers,
-    examples_in,
     folder_name,
     of_value,
     publishes,
@@ -58,10 +58,8 @@ from robins.cli.options import (
 from robins.cli.printing import carry_out, print_data
 from robins.cli.progress import Progress
 
-EXAMPLES = examples_in(__doc__)
 
-
-@click.group(short_help="Run a vehicle part by part over serial lines.", epilog=EXAMPLES["bench"])
+@click.group(short_help="Run a vehicle part by part over serial lines.")
 def bench() -> None:
     """The test bench: each part of a vehicle is a process or a board on a serial line."""
 
@@ -88,7 +86,7 @@ _NODE = option(
 _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with.")
 
 
-@bench.command(short_help="Start a bench and run a scenario on it.", epilog=EXAMPLES["up"])
+@bench.command(short_help="Start a bench and run a scenario on it.")
 @click.argument("scenario")
 @_FILTER
 @option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Length. [default: all]")
@@ -153,9 +151,7 @@ def status(as_json: bool) -> None:
     print_data({"benches": found}, table(found), as_json)
 
 
-@bench.command(
-    short_help="Send a record to a part again and compare its answers.", epilog=EXAMPLES["replay"]
-)
+@bench.command(short_help="Send a record to a part again and compare its answers.")
 @click.argument("record", type=LOGS)
 @option("--node", required=True, metavar="PART", help="Which part.")
 @_FILTER
@@ -191,7 +187,7 @@ def ports(as_json: bool) -> None:
     print_data({"ports": [port._asdict() for port in found]}, table(found), as_json)
 
 
-@bench.command(short_help="Run one part at a port, by hand.", epilog=EXAMPLES["node"])
+@bench.command(short_help="Run one part at a port, by hand.")
 @click.argument("part")
 @click.argument("port")
 @click.argument("scenario")
@@ -213,7 +209,7 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
     click.echo("The bench has said stop.")
 
 
-@bench.command(short_help="Print the wire as a C header, for firmware.", epilog=EXAMPLES["header"])
+@bench.command(short_help="Print the wire as a C header, for firmware.")
 @click.argument("rig", default="satellite")
 @option("--to", type=click.Path(path_type=Path), metavar="DIR", help="Write the examples too.")
 @DEBUG
@@ -239,3 +235,6 @@ def header(rig: str, to: Path | None) -> None:
     if examples:
         then = f"make -C {to} -f board.mk {examples[-1]}   builds an example for this machine"
     click.echo(f"Next:   {then}")
+
+
+add_examples(__doc__, bench)

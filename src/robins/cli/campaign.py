@@ -56,7 +56,7 @@ from click import option
 
 from robins.cli import cache
 from robins.cli.frame import ExitStatus, command_line, only_json
-from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples_in, of_value
+from robins.cli.options import OUT, TRUST, add_examples, answers, choices, of_value
 from robins.cli.printing import carry_out, print_and_write, print_data
 from robins.cli.progress import Progress
 
@@ -64,13 +64,8 @@ if TYPE_CHECKING:
     from robins.results import Outcome, Result
     from robins.workbench.campaign import CampaignStatus
 
-EXAMPLES = examples_in(__doc__)
 
-
-@click.group(
-    short_help="Run a scenario many times, on all cores or machines; nothing is lost.",
-    epilog=EXAMPLES["campaign"],
-)
+@click.group(short_help="Run a scenario many times, on all cores or machines; nothing is lost.")
 def campaign() -> None:
     """Campaigns: thousands of runs, kept in a folder that any number of workers fill.
 
@@ -101,15 +96,12 @@ def _held(held: bool) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-@campaign.command(short_help="Begin a campaign, or go on with it.", epilog=EXAMPLES["run"])
+@campaign.command(short_help="Begin a campaign, or go on with it.")
 @click.argument("scenario")
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="How many. [default: as given]")
 @option("--workers", type=click.IntRange(min=0), help="Processes. [default: one a core]")
-@MACHINE
 @choices
-@TRUST
-@answers
 def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: Any) -> None:
     """Run SCENARIO many times, with as many processes as there are cores.
 
@@ -144,9 +136,7 @@ def _deliver(
     print_and_write(outcome, write, writing, as_json)
 
 
-@campaign.command(
-    short_help="Compute what is missing, as one more worker.", epilog=EXAMPLES["work"]
-)
+@campaign.command(short_help="Compute what is missing, as one more worker.")
 @_WHERE
 @option("--held", is_flag=True, hidden=True, expose_value=False, callback=of_value(_held))
 @TRUST
@@ -165,7 +155,7 @@ def work(where: str, as_json: bool) -> None:
     print_data({"done": done, "shards": total}, text, as_json)
 
 
-@campaign.command(short_help="How far a campaign is.", epilog=EXAMPLES["status"])
+@campaign.command(short_help="How far a campaign is.")
 @_WHERE
 @answers
 def status(where: str, as_json: bool) -> None:
@@ -213,10 +203,7 @@ def _progress_text(where: str, found: CampaignStatus) -> str:
     return "\n".join(lines)
 
 
-@campaign.command(
-    short_help="Compute a share of a campaign again, and compare the bits.",
-    epilog=EXAMPLES["verify"],
-)
+@campaign.command(short_help="Compute a share of a campaign again, and compare the bits.")
 @_WHERE
 @option("--share", type=click.FloatRange(0.0, 1.0, min_open=True), default=0.01, show_default=True)
 @TRUST
@@ -238,9 +225,7 @@ def verify(where: str, share: float, as_json: bool) -> int:
     return ExitStatus.FAILED if found.damaged or found.different else ExitStatus.DONE
 
 
-@campaign.command(
-    short_help="One run of a campaign alone, with all its histories.", epilog=EXAMPLES["show"]
-)
+@campaign.command(short_help="One run of a campaign alone, with all its histories.")
 @_WHERE
 @option("--run", "number", type=click.IntRange(min=0), required=True, help="Its number.")
 @OUT
@@ -257,7 +242,7 @@ def _result(where: str, what: str) -> Path:
     return Path("results") / f"{where.rstrip('/').rpartition('/')[2]}-{what}"
 
 
-@campaign.command(short_help="Figures of all runs that are there.", epilog=EXAMPLES["report"])
+@campaign.command(short_help="Figures of all runs that are there.")
 @_WHERE
 @OUT
 @TRUST
@@ -274,19 +259,13 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
     _deliver(bench, where, outcome, as_json, out)
 
 
-@click.command(
-    short_help="Run a scenario over the values of one parameter, or of two.",
-    epilog=EXAMPLES["sweep"],
-)
+@click.command(short_help="Run a scenario over the values of one parameter, or of two.")
 @click.argument("scenario")
 @option("--vary", multiple=True, required=True, metavar="key=a,b,c", help="Once, or twice.")
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="At each point. [default: as given]")
 @option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
-@MACHINE
 @choices
-@TRUST
-@answers
 def sweep(scenario: str, out: str, as_json: bool, **options: Any) -> None:
     """Run SCENARIO for each value of one parameter or of two, with the same random numbers.
 
@@ -298,3 +277,6 @@ def sweep(scenario: str, out: str, as_json: bool, **options: Any) -> None:
     with only_json(as_json), Progress() as progress:
         outcome = bench.sweep(scenario, out, progress=progress, **options)
     _deliver(bench, out, outcome, as_json)
+
+
+add_examples(__doc__, campaign, sweep)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,18 @@ def examples(*lines: str) -> str:
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
 
 
-def examples_in(text: str | None) -> Mapping[str, str]:
-    """Examples of each command in the docstring of a module, by the last word of their heading."""
-    if text is None:  # by python -OO
-        return defaultdict(str)
-    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text)
-    blocks = (map(str.strip, part.strip().splitlines()) for part in parts[1::2])
-    return {name: examples(*lines) for name, lines in zip(parts[::2], blocks, strict=True)}
+def add_examples(text: str | None, *commands: click.Command) -> None:
+    """End the help of commands, and of those within a group, with the examples of a docstring.
+
+    The last word of their heading is the name of the command. Python -OO leaves no docstring.
+    """
+    _, *parts = re.split(r"\n\nExamples of `[\w ]*?(\w+)`::\n\n", text or "")
+    blocks = dict(zip(parts[::2], parts[1::2], strict=True))
+    for one in commands:
+        if lines := blocks.get(one.name or "", "").strip().splitlines():
+            one.epilog = examples(*map(str.strip, lines))
+        if isinstance(one, click.Group):
+            add_examples(text, *one.commands.values())
 
 
 Callback = Callable[[click.Context, click.Parameter, Any], Any]
@@ -171,8 +175,8 @@ FILTER = option("--filters", "filter_name", callback=of_value(_one_filter), **_F
 
 
 def choices(command: Callable) -> Callable:
-    """Options that commands on a campaign share."""
-    return SEED(SETTINGS(FILTERS(command)))
+    """Options that commands share which compute a campaign."""
+    return MACHINE(SEED(SETTINGS(FILTERS(TRUST(answers(command))))))
 
 
 def folder_name(scenario: str) -> str:
