@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
@@ -39,11 +40,6 @@ class CampaignState(NamedTuple):
         return None if self.lacking else digest(self.found)
 
 
-def blank_statistics(problem: Problem | None) -> Statistics:
-    """Statistics of no runs; without a problem they can be merged but give no figures."""
-    return Statistics(()) if problem is None else Statistics.of(problem)
-
-
 def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> CampaignState:
     """Read all shards, check and join them.
 
@@ -53,25 +49,25 @@ def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> 
         problem: whose figures are wanted; without it sums and counts only.
     """
     there = store.names("shards")
-    found = {name: blank_statistics(problem) for name in plan.filters}
+    blank = Statistics(()) if problem is None else Statistics.of(problem)
+    found = {name: blank.blank() for name in plan.filters}
     examples = {name: problem and example_of(problem, name) for name in plan.filters}
-    damaged, lacking = [], 0
-    for shards in plan.shards.values():
-        for shard in shards:
-            of_chunk = blank_statistics(problem)
-            is_there = PurePosixPath(shard.name).name in there
-            content = store.get(shard.name) if is_there else None
-            if content is None:
-                lacking += 1
-                continue
-            try:
-                unpack(content, of_chunk, examples[shard.filter])
-            except DamagedShardError:
-                damaged.append(shard)
-                lacking += 1
-                continue
+    damaged, missing = [], 0
+    for shard in itertools.chain(*plan.shards.values()):
+        is_there = PurePosixPath(shard.name).name in there
+        content = store.get(shard.name) if is_there else None
+        if content is None:
+            missing += 1
+            continue
+        of_chunk = blank.blank()
+        try:
+            unpack(content, of_chunk, examples[shard.filter])
+        except DamagedShardError:
+            damaged.append(shard)
+        else:
             found[shard.filter].merge(of_chunk)
-    return CampaignState(found, {name: s.runs for name, s in found.items()}, damaged, lacking)
+    done = {name: s.runs for name, s in found.items()}
+    return CampaignState(found, done, damaged, missing + len(damaged))
 
 
 def example_of(problem: Problem, name: str) -> PyTree:

@@ -28,7 +28,7 @@ from robins.filters.run import checked, nothing
 from robins.filters.values import as_data
 from robins.manifold import State, local
 from robins.program.liveness import bytes_of_jaxpr
-from robins.systems.study import Case, Contender, Problem
+from robins.systems.study import Case, Contender, Problem, View
 from robins.systems.suspects import probabilities
 from robins.systems.tables import updates
 
@@ -227,9 +227,9 @@ def record(problem: Problem, name: str, worlds: PyTree, count: int) -> dict[str,
     return first_runs(_records(*_given(problem, name), worlds), count)
 
 
-def blocks_of(problem: Problem) -> Blocks:
+def blocks_of(view: View) -> Blocks:
     """The blocks of a problem as arguments of compiled code."""
-    return tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
+    return tuple((b.name, b.where.start, b.where.stop) for b in view.blocks)
 
 
 _NEEDED = ("innovation", "sigma", "nis", "dof")  # fields of updates that statistics use

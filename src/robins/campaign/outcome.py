@@ -159,7 +159,9 @@ DRAWS, SEED = 200, 1993  # of the bootstrap
 def _metrics(
     problem: Problem, name: str, s: Statistics, bound: np.ndarray | None
 ) -> dict[str, Any]:
-    out = problem.metrics(s) | dict(problem.contenders[name].facts) | _chances(s)
+    out = problem.metrics(s) | dict(problem.contenders[name].facts)
+    if s.runs > 1:  # one run alone has no share
+        out["diverged_share"] = Probability.among(s.lost)
     out |= _scores(problem, s)
     return out if bound is None else out | _over_bound(problem, s, bound)
 
@@ -183,11 +185,6 @@ def _claims(
 def _undecided(key: str, more: int | None) -> str:
     how = f"about {more} more runs decide it" if more else "more runs will hardly decide it"
     return f"The claim {key} is undecided: its interval reaches an edge of its band; {how}."
-
-
-def _chances(s: Statistics) -> dict[str, Probability]:
-    """Shares of runs in which a filter diverges; one run alone has none."""
-    return {"diverged_share": Probability.among(s.lost)} if s.runs > 1 else {}
 
 
 def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str, float]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import NamedTuple
 
 from robins.campaign.plan import Chunk, Shard
 from robins.campaign.shards import DamagedShardError, unpack
@@ -20,13 +19,6 @@ from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 
 NAMED, DIVERGED = "histories", "diverged"  # groups of objects
-
-
-class RunHistories(NamedTuple):
-    """The histories of one run of a filter."""
-
-    run: int
-    name: str  # of its object
 
 
 def name_of(group: str, shard: Shard, run: int) -> str:
@@ -39,36 +31,33 @@ def by_stem(shards: Mapping[Chunk, list[Shard]]) -> dict[str, Shard]:
     return {shard.stem: shard for some in shards.values() for shard in some}
 
 
-def histories(
-    store: Store, group: str, shards: Mapping[str, Shard]
-) -> dict[str, list[RunHistories]]:
-    """Histories that a group holds, by filter, in the order of the runs.
+def histories(store: Store, group: str, shards: Mapping[str, Shard]) -> dict[str, dict[int, str]]:
+    """Names of the histories that a group holds, by filter and run, in the order of the runs.
 
     Args:
         store: of the campaign.
         group: `NAMED` or `DIVERGED`.
         shards: of `by_stem`; histories of other shards are left out.
     """
-    found: dict[str, list[RunHistories]] = {}
+    found: dict[str, dict[int, str]] = {}
     for name in store.names(group):
         stem, _, run = PurePosixPath(name).stem.partition("-")
         if stem in shards and run.isdecimal():
-            of = found.setdefault(shards[stem].filter, [])
-            of.append(RunHistories(int(run), f"{group}/{name}"))
-    return {name: sorted(of) for name, of in found.items()}
+            found.setdefault(shards[stem].filter, {})[int(run)] = f"{group}/{name}"
+    return {name: dict(sorted(of.items())) for name, of in found.items()}
 
 
 def trim(store: Store, shards: Mapping[str, Shard], name: str, most: int) -> None:
     """Drop the histories of diverged runs of a filter beyond the first `most`."""
-    for history in histories(store, DIVERGED, shards).get(name, [])[most:]:
-        store.drop(history.name)
+    for history in list(histories(store, DIVERGED, shards).get(name, {}).values())[most:]:
+        store.drop(history)
 
 
 def kept(store: Store, shards: Mapping[str, Shard]) -> dict[str, list[int]]:
     """Numbers of the runs whose histories are there, by filter."""
     groups = [histories(store, group, shards) for group in (NAMED, DIVERGED)]
     return {
-        name: sorted({h.run for of in groups for h in of.get(name, [])})
+        name: sorted({run for of in groups for run in of.get(name, ())})
         for name in dict.fromkeys(name for of in groups for name in of)
     }
 
@@ -83,9 +72,9 @@ def damaged(store: Store, shards: Mapping[str, Shard]) -> dict[str, Shard]:
     found = {}
     for group in (NAMED, DIVERGED):
         for of in histories(store, group, shards).values():
-            for one in of:
+            for name in of.values():
                 try:
-                    unpack(store.get(one.name) or b"", Statistics(()), None)
+                    unpack(store.get(name) or b"", Statistics(()), None)
                 except DamagedShardError:
-                    found[one.name] = shards[PurePosixPath(one.name).stem.partition("-")[0]]
+                    found[name] = shards[PurePosixPath(name).stem.partition("-")[0]]
     return found

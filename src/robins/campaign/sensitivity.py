@@ -29,7 +29,7 @@ from scipy import stats
 
 from robins.campaign.machine import one_by_one
 from robins.campaign.many_runs import ManyRuns
-from robins.campaign.monte_carlo import one_record
+from robins.campaign.monte_carlo import blocks_of, one_record
 from robins.errors import require
 from robins.filters import Belief
 from robins.filters.model import Data
@@ -150,8 +150,7 @@ class SensitivityRuns(NamedTuple):
         world = self.study.simulate(
             with_numbers(self.given, numbers), self.course, self.seed, index
         )
-        blocks = tuple((b.name, b.where.start, b.where.stop) for b in self.view.blocks)
-        record = one_record(blocks, self.contender, world, over=one_by_one)
+        record = one_record(blocks_of(self.view), self.contender, world, over=one_by_one)
         error, sigma = record["error"], record["sigma"]
         found = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(sigma))
         counted = error[self.view.count_from : self.view.count_to]

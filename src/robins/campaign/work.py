@@ -18,7 +18,6 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.campaign.gather import blank_statistics
 from robins.campaign.machine import JaxMachine, LaneMachine
 from robins.campaign.memory import release_memory
 from robins.campaign.plan import CampaignPlan, Chunk, Shard
@@ -96,7 +95,7 @@ class Worker:
         """The statistics of filters over a chunk."""
 
         def taken(name: str, record: dict[str, PyTree]) -> Statistics:
-            of_chunk = blank_statistics(self.problem)
+            of_chunk = Statistics.of(self.problem)
             of_chunk.add(record)
             if chunk.number:
                 of_chunk.example = None  # figures show the first run of all
@@ -117,7 +116,7 @@ class Worker:
         }
 
     def _alone(self, record: dict[str, PyTree], index: int) -> Statistics:
-        one = blank_statistics(self.problem)
+        one = Statistics.of(self.problem)
         one.add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
         return one
 
@@ -132,8 +131,8 @@ class Worker:
         group = {run: NAMED for run in self.plan.keep if run in every}
         lost = [every[k] for k in np.flatnonzero(statistics.lost)] if most != 0 else []
         if lost and most is not None:
-            there = histories(self.store, DIVERGED, self._stems).get(shard.filter, [])
-            first = sorted({*lost, *(h.run for h in there)})[:most]
+            there = histories(self.store, DIVERGED, self._stems).get(shard.filter, {})
+            first = sorted({*lost, *there})[:most]
             lost = [run for run in lost if run in first]
         group = dict.fromkeys(lost, DIVERGED) | group
         if not group:

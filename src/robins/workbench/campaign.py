@@ -16,7 +16,7 @@ import numpy as np
 from robins import _float64, scenario
 from robins.campaign import check_machine, retention
 from robins.campaign.bound import bound_sigma
-from robins.campaign.gather import CampaignState, blank_statistics, example_of, gather
+from robins.campaign.gather import CampaignState, example_of, gather
 from robins.campaign.machine import first_run, first_worlds, machine_for
 from robins.campaign.outcome import outcome_of
 from robins.campaign.plan import (
@@ -312,7 +312,7 @@ def campaign_show(where: Where, run: int, *, progress: Progress = ignore_progres
 
 def _kept(store: Store, shard: Shard, run: int, problem: Problem) -> Statistics | None:
     """A run with its histories as they were kept; None where they are not, or are damaged."""
-    content, one = content_of(store, shard, run), blank_statistics(problem)
+    content, one = content_of(store, shard, run), Statistics.of(problem)
     if content is None:
         return None
     try:
