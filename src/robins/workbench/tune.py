@@ -40,6 +40,8 @@ from robins.workbench.tune_objectives import (
     worded,
 )
 
+_COLUMNS = ("parameter", "as written", "factor", "low", "high", "now")  # of tuning.csv
+
 
 def tune(
     names: Annotated[Sequence[str], Option(metavar="SCENARIO|LOG...")],
@@ -134,16 +136,20 @@ def _outcome(of: TuningRequest, found: Tuned, seed: int) -> Outcome:
         f"{of.filter} tuned": _metrics(of, found.before if stays else found.after)
         | {f"{v.key} times": band[0] for v, band in zip(of.vary, bands, strict=True) if not stays},
     }
+    was = [scenario.setting(v.key, v.start).partition("=")[2] for v in of.vary]
     lines = [
-        f"{v.key}: {scenario.setting(v.key, v.start).partition('=')[2]} times {band[0]:.3g} "
-        f"({band[1]:.3g} to {band[2]:.3g} at 95 %)"
-        for v, band in zip(of.vary, bands, strict=True)
+        f"{v.key}: {old} times {band[0]:.3g} ({band[1]:.3g} to {band[2]:.3g} at 95 %)"
+        for v, old, band in zip(of.vary, was, bands, strict=True)
+    ]
+    table: list[Sequence[str | float]] = [
+        (v.key, old, *band, line.partition("=")[2])
+        for v, old, band, line in zip(of.vary, was, bands, now, strict=True)
     ]
     how = "gradient" if found.gradient else "search"
     return Outcome(
         solution=_solution(of, found, np.array(bands)),
         metrics=rows,
-        files={"tuned.toml": text.encode(), "tuning.csv": csv_of(_table(of, bands, now))},
+        files={"tuned.toml": text.encode(), "tuning.csv": csv_of([_COLUMNS, *table])},
         notes=[
             *lines,
             f"Held out: {change}.",
@@ -188,18 +194,6 @@ def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, float]:
         if square > 0.0:
             out[f"{b.name}_stated_over_rms"] = math.sqrt(variance / square)
     return out
-
-
-def _table(
-    of: TuningRequest, bands: Sequence[tuple[float, float, float]], now: Sequence[str]
-) -> Sequence[Sequence[str | float]]:
-    rows: list[Sequence[str | float]] = [
-        ("parameter", "as written", "factor", "low", "high", "now")
-    ]
-    for v, band, line in zip(of.vary, bands, now, strict=True):
-        was = scenario.setting(v.key, v.start).partition("=")[2]
-        rows.append((v.key, was, *band, line.partition("=")[2]))
-    return rows
 
 
 def _solution(of: TuningRequest, found: Tuned, bands: np.ndarray) -> xr.Dataset:
