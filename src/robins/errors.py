@@ -27,8 +27,12 @@ class RobinsError(Exception):
 
     bad_input: bool = True
 
-    def __init__(self, what: str, where: object = "", fix: str = ""):
+    def __init__(
+        self, what: str, where: object = "", fix: str = "", *, bad_input: bool | None = None
+    ):
         self.what, self.where, self.fix = what, str(where), fix
+        if bad_input is not None:  # else as the class has it
+            self.bad_input = bad_input
         super().__init__(str(self))
 
     def __str__(self) -> str:

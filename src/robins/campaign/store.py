@@ -59,7 +59,9 @@ class FolderStore:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-                placed = _replace(partial, target) if overwrite else _link(partial, target)
+                if overwrite:
+                    os.replace(partial, target)
+                placed = overwrite or _link(partial, target)
                 sync(target.parent)
             finally:
                 partial.unlink(missing_ok=True)
@@ -102,13 +104,12 @@ class FolderStore:
         fix = "make room" if full else "make the folder readable and writable"
         fix = f"{fix}; what is there is whole, and {GOES_ON}"
         given = error.errno in _NO_FOLDER
-        failure = RobinsError(
+        return RobinsError(
             f"cannot {what}: {error.strerror or error}",
             self.where,
             "name the folder of a campaign, or a new one." if given else fix,
+            bad_input=given,
         )
-        failure.bad_input = given
-        return failure
 
 
 def _link(partial: Path, target: Path) -> bool:
@@ -120,12 +121,7 @@ def _link(partial: Path, target: Path) -> bool:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        return _replace(partial, target)  # an object that is there has the same content
-    return True
-
-
-def _replace(partial: Path, target: Path) -> bool:
-    os.replace(partial, target)
+        os.replace(partial, target)  # an object that is there has the same content
     return True
 
 
@@ -182,13 +178,11 @@ class ObjectStore:
         except (FileNotFoundError, errors.AlreadyExistsError):
             raise
         except errors.BaseError as error:
-            raise self._cannot(what, error) from error
-
-    def _cannot(self, what: str, error: Exception) -> RobinsError:
-        first = (str(error).strip().splitlines() or [""])[0]
-        failure = RobinsError(f"cannot {what}: {first}", self.where, "check address and rights.")
-        failure.bad_input = False
-        return failure
+            first = (str(error).strip().splitlines() or [""])[0]
+            fix = "check address and rights."
+            raise RobinsError(
+                f"cannot {what}: {first}", self.where, fix, bad_input=False
+            ) from error
 
 
 Store = FolderStore | ObjectStore

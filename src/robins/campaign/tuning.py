@@ -103,8 +103,6 @@ class Tuned(NamedTuple):
 class UndeterminedError(RobinsError, ValueError):
     """The data do not determine a parameter."""
 
-    bad_input = True
-
 
 def choose(
     objective: Objective,

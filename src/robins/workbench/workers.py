@@ -175,6 +175,5 @@ def _judged(process: _Process, where: str) -> int:
 def _failed(why: str, where: str) -> RobinsError:
     """Error of a worker; folder and advice are not repeated if its message contains them."""
     why = why.removeprefix(f"{where}: ")
-    error = RobinsError(f"a worker failed: {why}", where, "" if why.endswith(GOES_ON) else GOES_ON)
-    error.bad_input = False
-    return error
+    fix = "" if why.endswith(GOES_ON) else GOES_ON
+    return RobinsError(f"a worker failed: {why}", where, fix, bad_input=False)
