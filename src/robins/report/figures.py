@@ -75,8 +75,7 @@ FIGURES = (
     Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused", EACH),
     Figure(updates.consistency, "consistency consistency_dof", EACH),
     Figure(instruments.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
-    Figure(sweeps.curves, "sweep_rms sweep_low sweep_high sweep_stated", EACH, sweeps.one_key),
-    Figure(sweeps.maps, "sweep_rms sweep_stated", EACH, sweeps.two_keys),
+    Figure(sweeps.errors, "sweep_rms sweep_low sweep_high sweep_stated", EACH),
     Figure(tuning, "tuned_factor tuned_low tuned_high judged_before judged_after"),
     Figure(
         sensitivity.budget,

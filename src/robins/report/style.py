@@ -205,10 +205,8 @@ def decades(axes: Axes, low: float, top: float) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None, tint: str = OUTAGE) -> None:
+def shade(axes: Axes, x: np.ndarray, mask: np.ndarray, tint: str = OUTAGE) -> None:
     """Shade where the mask holds."""
-    if mask is None or not mask.any():
-        return
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     last = len(x) - 1
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):

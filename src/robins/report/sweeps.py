@@ -17,14 +17,9 @@ from robins.results import find
 _DECADE = 8.0  # ratio of greatest to least error from which the colours are logarithmic
 
 
-def two_keys(solution: xr.Dataset, block: str) -> bool:
-    """True if two parameters are varied."""
-    return solution.sizes["sweep_2"] > 1
-
-
-def one_key(solution: xr.Dataset, block: str) -> bool:
-    """True if one parameter is varied."""
-    return not two_keys(solution, block)
+def errors(solution: xr.Dataset, block: str) -> Picture:
+    """Curves over one parameter, or maps over two."""
+    return (maps if solution.sizes["sweep_2"] > 1 else curves)(solution, block)
 
 
 def _axis(solution: xr.Dataset, dim: str) -> tuple[np.ndarray, list[str], str]:

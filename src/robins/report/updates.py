@@ -85,7 +85,8 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     filters = series.filters(solution)
     figure, stack, clock = series.stacked(solution, data, more=int(nis is not None))
     x = data.x / clock.seconds
-    refused = _refused(solution, sensor, data.values.shape[:2])
+    found = series.get(solution, "refused", sensor)
+    refused = np.zeros(data.values.shape[:2], bool) if found is None else found.values[..., 0] > 0.0
     present = [i for i in range(len(filters)) if np.isfinite(data.values[i]).any()]
     for k, axes in enumerate(stack[: len(data.axes)]):
         shown = []
@@ -123,12 +124,6 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     if any(axes.get_yscale() == "symlog" for axes in stack):
         caption += " Far from zero the scale is logarithmic."
     return Picture(f"innovation_{sensor}", f"Innovations of {name}", caption, figure)
-
-
-def _refused(solution: xr.Dataset, sensor: str, shape: tuple[int, int]) -> np.ndarray:
-    """Mask of the updates that a gate refused, (filter, update time)."""
-    found = series.get(solution, "refused", sensor)
-    return np.zeros(shape, bool) if found is None else found.values[..., 0] > 0.0
 
 
 def _compress(axes: Axes, values: list[np.ndarray]) -> None:
