@@ -22,7 +22,7 @@ from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import Blocks, blocks_of, one_record
 from robins.campaign.sensitivity import course_differs
 from robins.campaign.tuning import Data, Objective, Tree, Trial, UndeterminedError
-from robins.filters import Filter, Model, run
+from robins.filters import Filter, run
 from robins.filters.analysis.predictive import predicted, scored
 from robins.filters.values import as_data, content, kind, value
 from robins.results import Progress
@@ -287,15 +287,6 @@ def _components(y: Tree, dim: int) -> int:
     return int(np.sum(np.minimum(each, dim)))
 
 
-def _steps(filter_: Filter, model: Model, given: Sequence[Sequence[Any]]) -> Array:
-    """(E, 2) log density of the measurements of each step of all pieces, and their components."""
-    rows = []
-    for start, y, u, aux in given:
-        of = run(filter_, model, start, y, u, aux, keep=predicted).steps
-        rows.append(jnp.stack([of.log_density, of.components.astype(float)], axis=1))
-    return jnp.concatenate(rows)
-
-
 @value
 class SegmentMeasure:
     """Measures of a log by segments of equally many steps."""
@@ -304,6 +295,11 @@ class SegmentMeasure:
 
     def __call__(self, numbers: Any, _: Any) -> Array:
         """(segments, 2) log density and number of components."""
-        steps = _steps(*numbers)
+        filter_, model, pieces = numbers
+        rows = []
+        for start, y, u, aux in pieces:
+            of = run(filter_, model, start, y, u, aux, keep=predicted).steps
+            rows.append(jnp.stack([of.log_density, of.components.astype(float)], axis=1))
+        steps = jnp.concatenate(rows)
         place = jnp.arange(len(steps)) * self.segments // len(steps)
         return jax.ops.segment_sum(steps, place, self.segments)
