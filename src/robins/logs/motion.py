@@ -22,12 +22,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from robins.dataset import GnssTable
+from robins.ins.plausible import EARTH_RATE
 from robins.logs.quiet import ImuSignal
 from robins.rotation import skew
 
 GRAVITY = 9.8
 RATE_HZ = 20
-EARTH_RATE = 7.292115e-5  # rad/s, WGS 84
 _STRETCH_S = 15.0  # long enough for turns, short enough for the drift of low-cost gyros
 _CHANGES = 8  # least number of velocity changes in a stretch
 _MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 20, 6, 8
@@ -290,8 +290,8 @@ def squares_by_lag(views: MotionIntegrals, lags_s: np.ndarray) -> np.ndarray:
     turn, push = np.diff(views.turn, axis=0), np.diff(views.push, axis=0)
     C = _attitudes(turn)
     dS = np.einsum("nij,nj->ni", C[:-1] @ rotations(0.5 * turn), push)
-    S = np.concatenate([np.zeros((1, 3)), np.cumsum(dS, axis=0)])
-    D = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (S[1:] + S[:-1]), axis=0)]) / RATE_HZ
+    S = cumulative(dS)
+    D = cumulative(0.5 * (S[1:] + S[:-1])) / RATE_HZ
     out = np.full((len(views.start_s), len(lags_s)), np.nan)
     for s in range(len(out)):
         nodes = views.node_of == s
@@ -329,7 +329,7 @@ def squares_by_map(views: MotionIntegrals, maps: np.ndarray, shift_s: np.ndarray
         turned = np.einsum("hij,kj->hki", maps, turn)
         C = composed(rotations(turned))
         dS = np.einsum("hkij,kj->hki", C[:, :-1] @ rotations(0.5 * turned), push)
-        S = np.concatenate([np.zeros_like(dS[:, :1]), np.cumsum(dS, axis=1)], axis=1)
+        S = cumulative(dS, axis=1)
         nodes = views.node_of == s
         begin, end = (
             np.clip((t[nodes] - views.start_s[s]) * RATE_HZ, 0, count)
@@ -381,14 +381,19 @@ def composed(steps: np.ndarray) -> np.ndarray:
     return out
 
 
+def cumulative(steps: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Sums of steps along an axis, from zero before the first one."""
+    sums = np.cumsum(steps, axis=axis)
+    return np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis=axis)
+
+
 def integral(time_s: np.ndarray, rate: np.ndarray, kind: str = "rate") -> np.ndarray:
     """Integral (n, 3) of a rate (n, 3) from the first sample up to each.
 
     By the trapezoidal rule; for increments, rates are means since the previous sample.
     """
     mean = rate[1:] if kind == "increment" else 0.5 * (rate[1:] + rate[:-1])
-    steps = mean * np.diff(time_s)[:, None]
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return cumulative(mean * np.diff(time_s)[:, None])
 
 
 def at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:

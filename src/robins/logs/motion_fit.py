@@ -28,6 +28,7 @@ from robins.logs.motion import (
     MotionIntegrals,
     between,
     composed,
+    cumulative,
     kabsch,
     power_of,
     rotations,
@@ -133,7 +134,7 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
         for t in (views.begin_s, views.end_s)
     )
     at = partial(_sampled, views.node_of)
-    angle, C_end = _cumulative(dphi), at(end, C)
+    angle, C_end = cumulative(dphi, axis=1), at(end, C)
 
     def speed(index: np.ndarray) -> np.ndarray:
         """Velocity (nodes, 3, 1) of the antenna."""
@@ -141,7 +142,7 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
 
     if views.means:
         over = ((end - begin) / RATE_HZ)[:, None, None]
-        D = _cumulative((S[:, 1:] + S[:, :-1]) * (0.5 / RATE_HZ))
+        D = cumulative((S[:, 1:] + S[:, :-1]) * (0.5 / RATE_HZ), axis=1)
         u = (at(end, D) - at(begin, D)) / over
         force = (speed(end) - speed(begin)) / over
         swing = (C_end - at(begin, C)) / over
@@ -208,14 +209,7 @@ def _grown(
     by_turn = -skew(dS) @ psi
     by_force = np.einsum("skij,skl->skijl", Cm, push)[..., _UPPER[0], _UPPER[1]]
     columns = np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1)
-    return _cumulative(columns), C
-
-
-def _cumulative(steps: np.ndarray) -> np.ndarray:
-    """Sums up to each of the fine times, along the second axis."""
-    out = np.zeros((len(steps), steps.shape[1] + 1, *steps.shape[2:]))
-    np.cumsum(steps, axis=1, out=out[:, 1:])
-    return out
+    return cumulative(columns, axis=1), C
 
 
 def _recorded(views: MotionIntegrals, first: np.ndarray, last: np.ndarray) -> np.ndarray:

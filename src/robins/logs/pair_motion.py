@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable, Trajectory
+from robins.ins.plausible import G
 from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
 from robins.logs.quiet import signal_of
 from robins.rotation import skew
 
-GRAVITY = 9.80665  # m/s^2
 _WINDOW_S = 0.5  # longest window, in which the body hardly turns
 _LONGEST_S = 2.0
 _HALF_S = 0.05  # half width of the mean of gyro rates
@@ -138,7 +138,7 @@ def forces_of(shared: SharedMotion) -> tuple[np.ndarray, np.ndarray] | None:
     if p is None:
         return None
     _, length_s, C, gained, pushed = p
-    f_n = gained / length_s[:, None] - [0.0, 0.0, GRAVITY]
+    f_n = gained / length_s[:, None] - [0.0, 0.0, G]
     return np.einsum("kji,kj->ki", C, f_n), pushed / length_s[:, None]
 
 
@@ -157,7 +157,7 @@ def fit_velocity(v_n: np.ndarray, shared: SharedMotion) -> np.ndarray | None:
         return None
     at_, length_s, C, gained, pushed = p
     along = length_s[:, None, None]
-    missing = gained - np.einsum("kij,kj->ki", C, pushed) - along[:, 0] * [0, 0, GRAVITY]
+    missing = gained - np.einsum("kij,kj->ki", C, pushed) - along[:, 0] * [0, 0, G]
     early, late = (at(shared.time_s + k * _HALF_S, shared.sample_s, shared.angle) for k in (-1, 1))
     swing = np.diff(shared.q.as_matrix() @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[at_]
     design = np.concatenate([C * along, np.eye(3) * along, C @ skew(pushed), swing], axis=-1)
