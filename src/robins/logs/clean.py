@@ -174,11 +174,10 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
 
 def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, Rows]]:
     """Good rows, and bad ones by their first reason, if one bad number refuses a row."""
-    nan = np.isnan(values).any(axis=1)
-    inf = np.isinf(values).any(axis=1) & ~nan
-    with np.errstate(invalid="ignore"):
-        absurd = (np.abs(values) > limit).any(axis=1) & ~nan & ~inf
-    return ~(nan | inf | absurd), {"nan": nan, "inf": inf, "absurd": absurd}
+    _, bad = _numbers(values, limit)
+    bad["inf"] &= ~bad["nan"]
+    bad["absurd"] &= ~bad["nan"] & ~bad["inf"]
+    return ~(bad["nan"] | bad["inf"] | bad["absurd"]), bad
 
 
 def _numbers(values: np.ndarray, limit: np.ndarray | float) -> tuple[np.ndarray, dict[str, Rows]]:
