@@ -76,8 +76,7 @@ def _gravity(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Fin
             "with a bias sigma of at least that."
         )
         return
-    causes = [*_rates_for_increments(imu, signal.step_s), *_unit_causes(measured)]
-    causes = [*_increments_for_rates(imu, signal.step_s, measured), *causes]
+    causes = list(_causes(imu, signal.step_s, measured))
     shown = f"{where} the specific force is {measured:.4g} m/s^2 where gravity is 9.8"
     if causes:
         yield error(imu, causes[0][0], measured, row)(
@@ -102,55 +101,43 @@ def _gravity(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Fin
         )
 
 
-_READINGS = ((G, "m/s^2", "m/s"), (1.0, "g", "g s"))
+# Gravity, its unit in rates and in increments, and what else to do.
+_READINGS = (
+    (G, "m/s^2", "m/s", ""),
+    (1.0, "g", "g s", " (and the accelerations by 9.80665)"),
+)
 
 
-def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, str]]:
-    """Detect rates labelled as increments: the raw specific force has the size of gravity."""
-    raw = signal_of(dataclasses.replace(imu, kind="rate"))
-    if imu.kind == "rate" or raw is None:
-        return
-    windows = windows_of(raw)
-    measured = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
-    for scale, unit, _ in _READINGS:
-        if is_near(measured, scale):
-            yield (
-                "rates_as_increments",
-                f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
-                f"multiply accelerations{_g_word(unit)} and angular rates by that time, or name a "
-                "format of rates",
-            )
+def _causes(imu: ImuTable, step_s: float, measured: float) -> Iterator[tuple[str, str]]:
+    """Codes and causes of a specific force at rest that is not gravity in m/s^2.
 
-
-def _increments_for_rates(
-    imu: ImuTable, step_s: float, measured: float
-) -> Iterator[tuple[str, str]]:
-    """Detect increments labelled as rates: the specific force is gravity times the step.
-
-    A residual bias after removal of gravity looks alike, but then the motion is far larger.
+    Of increments labelled as rates it is gravity times the step. A residual bias after removal of
+    gravity looks alike, but then the motion is far larger. Of rates labelled as increments the raw
+    specific force has the size of gravity.
     """
-    moving = np.nanpercentile(np.linalg.norm(imu.accel, axis=1), 99.0)
-    if moving > _LIVELY * measured:
-        return
-    for scale, unit, summed in _READINGS:
-        if imu.kind == "rate" and is_near(measured, scale * step_s):
-            yield (
-                "increments_as_rates",
-                f"The rows are increments over {step_s * 1e3:.4g} ms in {summed}, not rates: "
-                f"divide both sensors by that time{_g_word(unit)}, or name a format of increments",
-            )
-
-
-def _g_word(unit: str) -> str:
-    return " (and the accelerations by 9.80665)" if unit == "g" else ""
-
-
-def _unit_causes(measured: float) -> list[tuple[str, str]]:
-    return [
-        ("gravity_unit", f"The unit is probably {unit}: {remedy}")
-        for value, (unit, remedy) in FORCE_UNITS.items()
-        if is_near(measured, value)
-    ]
+    if imu.kind == "rate":
+        moving = np.nanpercentile(np.linalg.norm(imu.accel, axis=1), 99.0)
+        for scale, _, unit, by_g in _READINGS:
+            if is_near(measured, scale * step_s) and not moving > _LIVELY * measured:
+                yield (
+                    "increments_as_rates",
+                    f"The rows are increments over {step_s * 1e3:.4g} ms in {unit}, not rates: "
+                    f"divide both sensors by that time{by_g}, or name a format of increments",
+                )
+    elif (raw := signal_of(dataclasses.replace(imu, kind="rate"))) is not None:
+        windows = windows_of(raw)
+        size = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
+        for scale, unit, _, by_g in _READINGS:
+            if is_near(size, scale):
+                yield (
+                    "rates_as_increments",
+                    f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
+                    f"multiply accelerations{by_g} and angular rates by that time, or name a "
+                    "format of rates",
+                )
+    for value, (unit, remedy) in FORCE_UNITS.items():
+        if is_near(measured, value):
+            yield "gravity_unit", f"The unit is probably {unit}: {remedy}"
 
 
 def _direction(windows: Windows) -> np.ndarray:
