@@ -51,7 +51,7 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
             severity = "note" if never else "error" if bad.all() else "warning"
             yield finding(severity, gnss, "gnss_missing", int(bad.sum()), k)(
                 f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "
-                f"{len(gnss)} fixes. The receiver had none, or the columns are others; `clean` "
+                f"{len(gnss)} fixes. The receiver had none, or the columns are others; a replay "
                 "leaves it out and keeps the other components of those fixes."
             )
 

@@ -128,8 +128,8 @@ def _shared(table: Table, size: float, step_s: float) -> Finding:
     remedy = (
         "A batch lasts so long that nothing can be timed in it; log the time with all its digits"
         if many_s > _LONGEST_BATCH_S
-        else f"`clean` spreads each batch evenly, {step_s * 1e3:.4g} ms apart; all may be early or "
-        f"late by up to {many_s * 1e3:.4g} ms, so log the sensor's own counter, or all digits"
+        else f"A replay spreads each batch evenly, {step_s * 1e3:.4g} ms apart; all may be early "
+        f"or late by up to {many_s * 1e3:.4g} ms, so log the sensor's own counter, or all digits"
     )
     severity = "error" if many_s > _LONGEST_BATCH_S else "warning"
     row = int(np.argmax(again)) + 1 if again.any() else None
@@ -150,7 +150,7 @@ def _duplicates(table: Table) -> Iterator[Finding]:
         )
         yield warning(table, "time_duplicate", len(again), int(again[0]))(
             f"{len(again)} samples ({share:.1%}) repeat the time of the sample before, this one "
-            f"first. {cause}; `clean` refuses the second of each."
+            f"first. {cause}; a replay refuses the second of each."
         )
 
 
@@ -166,7 +166,7 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         size = float(-step[k]) + usual
         cause = _named(size, usual, _WRAPS | _STEPS) or "The clock was set, or the logger restarted"
         yield error(table, "clock_set_back", float(step[k]), int(k) + 1)(
-            f"time goes back by {-step[k]:.6g} s and goes on from there. {cause}. `clean` refuses "
+            f"time goes back by {-step[k]:.6g} s and goes on from there. {cause}. A replay refuses "
             f"{lost} samples so that time increases, and what follows them is joined wrongly: "
             "split the file here, or add the step to all later stamps."
         )
@@ -174,7 +174,7 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         sizes = -step[slips]
         yield warning(table, "time_backward", len(slips), slips[0] + 1)(
             f"time goes back by {sizes.max():.6g} s for a sample or so ({len(slips)} such places, "
-            "this one first). Lines were swapped or a stamp is damaged; `clean` refuses those "
+            "this one first). Lines were swapped or a stamp is damaged; a replay refuses those "
             "samples and goes on."
         )
 
@@ -275,12 +275,11 @@ def _stamp_scatter(stamps: np.ndarray) -> float:
 def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:
     """Findings about the overlap of other tables with the IMU in time."""
     for other in others:
-        yield from _span_of(imu, other)
+        if len(imu) and len(other):
+            yield from _span_of(imu, other)
 
 
 def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
-    if not len(imu) or not len(other):
-        return
     (a, b), (c, d) = _span(imu), _span(other)
     overlap = min(b, d) - max(a, c)
     if overlap <= 0:

@@ -67,5 +67,5 @@ def check_limits(table: Table) -> Iterator[Finding]:
             yield warning(table, "absurd", int(rows.sum()), k)(
                 f"{name} is {worst:g} here, which no vehicle has; {rows.sum()} of {len(table)} "
                 "rows are like that. A bit or a digit was lost in the sensor, the recorder or the "
-                "copy; `clean` refuses those numbers and counts them."
+                "copy; a replay refuses those numbers and counts them."
             )
