@@ -22,7 +22,7 @@ from robins import logs, scenario, systems
 from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs.batches import spread
-from robins.logs.findings import by_severity
+from robins.logs.findings import SEVERITIES, by_severity
 from robins.logs.loading import by_kind, without_replaced
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
@@ -30,8 +30,6 @@ from robins.logs.tables import kind_of, tables_of
 from robins.logs.unit_file import find_unit, toml_of
 from robins.workbench.errors import InputError
 from robins.workbench.options import Logs
-
-SEVERITIES = ("error", "warning", "note")
 
 
 class LogExamination(NamedTuple):
