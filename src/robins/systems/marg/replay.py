@@ -159,8 +159,7 @@ def replay(
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
     lasted = np.asarray(log.world.u.samples.dt_s)
-    looks, disturbed = _looks(log, answers)
-    warned = disturbed + monitor.of_samples(log.counts, len(log.time_ns))
+    warned = monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
         warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
     predictions = next(iter(answers.values())).tally.counts()
@@ -172,7 +171,7 @@ def replay(
         metrics=metrics,
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
-        notes=[*_sentences(log, answers), *looks, *_about_north(dataset, north)],
+        notes=[*_sentences(log, answers), *_looks(log, answers), *_about_north(dataset, north)],
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
@@ -426,11 +425,9 @@ def _turned_from_to(log: PreparedMargLog, answer: FilterEstimates) -> str:
     return f"{answer.name}: {', '.join(said)}."
 
 
-def _looks(
-    log: PreparedMargLog, answers: Mapping[str, FilterEstimates]
-) -> tuple[list[str], list[str]]:
-    """Sentences on refused looks at the field, and warnings where they are a third or more."""
-    notes, warned = [], []
+def _looks(log: PreparedMargLog, answers: Mapping[str, FilterEstimates]) -> list[str]:
+    """Sentences on refused looks at the field; `replaying.outcome` warns of more than a third."""
+    notes = []
     for name, answer in answers.items():
         refused = _refused(log, answer)
         update, count = answer.updates.get(model.MAGNETOMETER), int(np.sum(refused))
@@ -438,8 +435,8 @@ def _looks(
         if looked and not count:
             notes.append(f"{name}: the field was undisturbed at all {looked} looks.")
         elif looked:
-            (warned if count >= looked / 3 else notes).append(
+            notes.append(
                 f"{name}: the field was disturbed at {count} of {looked} looks; heading "
                 "then came from the gyros."
             )
-    return notes, warned
+    return notes
