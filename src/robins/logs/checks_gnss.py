@@ -5,6 +5,7 @@ Also of their velocities against differences of positions: axes, unit, sign, del
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -249,27 +250,23 @@ def _late(gnss: GnssTable, track: FixTrack, late: float) -> Finding:
 
 def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
     """Change of v that fits p, in words ("": none needed; None: nothing fits), and scale."""
-    best = ("", 0.0, np.inf)
-    as_is = np.inf
-    for exchange in (False, True):
-        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            turned = (v[:, ::-1] if exchange else v) * signs
-            scale = max(float(np.sum(p * turned) / np.sum(v * v)), 0.0)
-            left = float(np.sum((p - scale * turned) ** 2) / np.sum(p * p))
-            words = "exchanged horizontal axes" if exchange else ""
-            minus = [name for name, s in zip(("north", "east"), signs, strict=True) if s < 0]
-            if minus:
-                words += f"{' and ' if words else ''}reversed {' and '.join(minus)}"
-            if words == "":
-                as_is = left
-            if scale > 0 and left < best[2]:
-                best = (words, scale, left)
-    if best[2] > 0.3:
+    fits: list[tuple[str, float, float]] = []  # words, scale, share left; as it is first
+    for exchange, *signs in itertools.product((False, True), (1, -1), (1, -1)):
+        turned = (v[:, ::-1] if exchange else v) * signs
+        scale = max(float(np.sum(p * turned) / np.sum(v * v)), 0.0)
+        left = float(np.sum((p - scale * turned) ** 2) / np.sum(p * p))
+        minus = [name for name, s in zip(("north", "east"), signs, strict=True) if s < 0]
+        words = ["exchanged horizontal axes"] if exchange else []
+        words += [f"reversed {' and '.join(minus)}"] if minus else []
+        fits.append((" and ".join(words), scale, left))
+    forward = [one for one in fits if one[1] > 0.0]
+    change, scale, left = min(forward, key=lambda one: one[2], default=("", 0.0, np.inf))
+    if left > 0.3:
         return None, 0.0
     # Along a straight road several changes fit equally well; then none is reported.
-    if best[0] != "" and as_is < 3.0 * best[2] + 0.02:
+    if change != "" and fits[0][2] < 3.0 * left + 0.02:
         return "", float(np.sum(p * v) / np.sum(v * v))
-    return best[0], best[1]
+    return change, scale
 
 
 def _vertical_reversed(steps: PositionSteps, track: FixTrack) -> bool:
