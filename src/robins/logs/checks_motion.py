@@ -85,7 +85,8 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
     share = f"(then {left:.0%} of the change of velocity is left unexplained, now {_all(before)})"
     wrong = []
     if {"gyros", "scale"} & {*verdict.free}:
-        wrong += _gyros(imu, verdict, found, signal.step_s, share)
+        of_gyros = list(_gyros(imu, verdict, found, signal.step_s, share))
+        wrong += of_gyros or _turned(imu, found, share)
     if "forces" in verdict.free:
         wrong += _forces(imu, found, share)
     yield from wrong
@@ -226,10 +227,10 @@ def _all(share: float) -> str:
 
 def _gyros(
     imu: ImuTable, verdict: ModelChoice, found: dict, step_s: float, share: str
-) -> list[Finding]:
-    """Findings about the matrix of the gyros."""
+) -> Iterator[Finding]:
+    """Findings about order, signs and scales in the matrix of the gyros."""
     P, state = _nearest(verdict.fit.state.M_g), verdict.fit.state
-    mirrored, out = bool(np.linalg.det(state.M_a) < 0.0), []
+    mirrored = bool(np.linalg.det(state.M_a) < 0.0)
     value, sigma = found["gyros"]
     each = [found[f"gyro {axis}"] for axis in "xyz"]
     left = verdict.fit.left(verdict.views)
@@ -237,18 +238,14 @@ def _gyros(
         changed = np.any(np.eye(3) != P, axis=1) | mirrored
         if all(s < _SURE * v for (v, s), own in zip(each, changed, strict=True) if own):
             code, cause = _meaning(P, mirrored)
-            out.append(
-                error(imu, code, left)(
-                    "gyros and accelerometers together do not explain the GNSS velocities, with "
-                    f"other axes they do {share}. {cause}."
-                )
+            yield error(imu, code, left)(
+                "gyros and accelerometers together do not explain the GNSS velocities, with other "
+                f"axes they do {share}. {cause}."
             )
         else:
-            out.append(
-                warning(imu, "motion_disagrees", left)(
-                    "the gyros explain the velocities only with other axes "
-                    f"{share}, but it turned too little about each axis to tell which."
-                )
+            yield warning(imu, "motion_disagrees", left)(
+                f"the gyros explain the velocities only with other axes {share}, but it turned too "
+                "little about each axis to tell which."
             )
     alike = all(abs(np.log(v / value)) < max(_NAMED * s / v, _OFF) for v, s in each)
     if alike and abs(np.log(value)) > max(_OFF, _SIGMAS * sigma / value):
@@ -256,25 +253,24 @@ def _gyros(
             "turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
             f"{value:.4g} +- {sigma:.2g} {share}"
         )
-        out.append(unit_finding(imu, value, sigma, step_s, shown))
+        yield unit_finding(imu, value, sigma, step_s, shown)
     elif not alike:
-        out += [
-            error(imu, "gyro_scale", v)(
-                f"the gyro about {axis} reads {1 / v:.3g} +- {s / v**2:.2g} times what the course "
-                f"turns {share}. Multiply it by {v:.4g}, or check its scale factor."
-            )
-            for axis, (v, s) in zip("xyz", each, strict=True)
-            if abs(v - 1.0) > max(_OFF, _SIGMAS * s) and s < _SURE * v
-        ]
+        for axis, (v, s) in zip("xyz", each, strict=True):
+            if abs(v - 1.0) > max(_OFF, _SIGMAS * s) and s < _SURE * v:
+                yield error(imu, "gyro_scale", v)(
+                    f"the gyro about {axis} reads {1 / v:.3g} +- {s / v**2:.2g} times what the "
+                    f"course turns {share}. Multiply it by {v:.4g}, or check its scale factor."
+                )
+
+
+def _turned(imu: ImuTable, found: dict, share: str) -> Iterator[Finding]:
+    """Report a small angle between the axes of the two triads."""
     angle, sigma = found["gyros turned"]
-    if not out and angle > max(_TURNED_DEG, _SIGMAS * sigma):
-        out.append(
-            error(imu, "gyro_axes", angle)(
-                f"the gyros are turned by {angle:.1f} +- {sigma:.1f} deg against the "
-                f"accelerometers {share}. Both triads must be given along the same axes."
-            )
+    if angle > max(_TURNED_DEG, _SIGMAS * sigma):
+        yield error(imu, "gyro_axes", angle)(
+            f"the gyros are turned by {angle:.1f} +- {sigma:.1f} deg against the accelerometers "
+            f"{share}. Both triads must be given along the same axes."
         )
-    return out
 
 
 def _named(value: float, sigma: float, names: dict[float, tuple[str, str]]) -> tuple | None:
