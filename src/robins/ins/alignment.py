@@ -364,14 +364,9 @@ def static_sigmas(
     f, omega = np.asarray(f_b, float), np.asarray(omega_ib_b, float)
     out = []
     for errors, signal in ((model.gyro, omega), (model.accel, f)):
-        variance = mean_sigma(errors, duration_s) ** 2
-        if errors.scale_sigma is not None:
-            variance = variance + (errors.scale_sigma * signal) ** 2
-        if errors.misalignment_sigma is not None:
-            variance = variance + errors.misalignment_sigma**2 @ signal**2
-        if errors.g_sensitivity_sigma is not None:
-            variance = variance + errors.g_sensitivity_sigma**2 @ f**2
-        out.append(np.sqrt(variance))
+        variance = mean_sigma(errors, duration_s) ** 2 + (errors.size("scale_sigma") * signal) ** 2
+        variance = variance + errors.size("misalignment_sigma") ** 2 @ signal**2
+        out.append(np.sqrt(variance + errors.size("g_sensitivity_sigma") ** 2 @ f**2))
     return out[0], out[1]
 
 

@@ -81,6 +81,11 @@ class TriadErrors:
         if (self.markov_sigma is None) != (self.markov_tau_s is None):
             raise ValueError("markov_sigma and markov_tau_s belong together: give both or neither")
 
+    def size(self, name: str) -> np.ndarray:
+        """Known value of a field; zeros of its shape where the sensor has no such error."""
+        found = getattr(self, name)
+        return np.zeros((3, 3) if name in _MATRICES else 3) if found is None else np.asarray(found)
+
 
 @value
 class ImuErrorModel:
@@ -210,21 +215,14 @@ def allan_deviation(errors: TriadErrors, tau_s: ArrayLike | float) -> np.ndarray
     `robins.ins.allan_noise`.
     """
     tau = np.asarray(tau_s, float)[..., None]
-    variance = np.zeros(np.broadcast_shapes(tau.shape, (3,)))
-    if errors.quantum is not None:
-        variance = variance + errors.quantum**2 / (4.0 * tau**2)
-    if errors.white is not None:
-        variance = variance + errors.white**2 / tau
+    quantum, white, walk, ramp = map(errors.size, ("quantum", "white", "walk", "ramp"))
+    variance = quantum**2 / (4.0 * tau**2) + white**2 / tau
     if errors.markov_sigma is not None:
         x = tau / errors.markov_tau_s
         closed = (x + 2.0 * np.expm1(-x) - 0.5 * np.expm1(-2.0 * x)) / x**2
         series = x / 3.0 - x**2 / 4.0 + 7.0 * x**3 / 60.0  # the closed form cancels at small x
         variance = variance + 2.0 * errors.markov_sigma**2 * np.where(x < 1e-4, series, closed)
-    if errors.walk is not None:
-        variance = variance + errors.walk**2 * tau / 3.0
-    if errors.ramp is not None:
-        variance = variance + errors.ramp**2 * tau**2 / 2.0
-    return np.sqrt(variance)
+    return np.sqrt(variance + walk**2 * tau / 3.0 + ramp**2 * tau**2 / 2.0)
 
 
 def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
@@ -239,19 +237,13 @@ def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
     """
     if not (np.isfinite(duration_s) and duration_s > 0.0):
         raise ValueError(f"duration_s must be a positive number of seconds, got {duration_s}")
-    variance = np.zeros(3)
-    if errors.bias_sigma is not None:
-        variance = variance + errors.bias_sigma**2
+    walk, white, quantum = map(errors.size, ("walk", "white", "quantum"))
+    variance = errors.size("bias_sigma") ** 2
     if errors.markov_sigma is not None:
         x = duration_s / errors.markov_tau_s
         variance = variance + 2.0 * (errors.markov_sigma / x) ** 2 * (x + np.expm1(-x))
-    if errors.walk is not None:
-        variance = variance + errors.walk**2 * duration_s / 3.0
-    if errors.white is not None:
-        variance = variance + errors.white**2 / duration_s
-    if errors.quantum is not None:
-        variance = variance + errors.quantum**2 / 6.0 / duration_s**2
-    return np.sqrt(variance)
+    variance = variance + walk**2 * duration_s / 3.0 + white**2 / duration_s
+    return np.sqrt(variance + quantum**2 / 6.0 / duration_s**2)
 
 
 # navigation: ring laser gyros and force-feedback pendulums of an airliner's inertial reference,
