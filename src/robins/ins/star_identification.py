@@ -37,6 +37,7 @@ from robins import _float64  # noqa: F401
 from robins.earth.stars import StarIndex, Stars, near, refuse_other_lengths
 from robins.errors import require
 from robins.filters.belief import Number
+from robins.ins.vector_attitude import checked_sigma
 from robins.rotation import rotate
 
 _WIDE = 4.0
@@ -279,18 +280,10 @@ def _height(b: np.ndarray) -> float:
 
 
 def _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance):
-    b, sigma = np.asarray(vectors_b, float), np.asarray(sigma_rad, float)
+    b = np.asarray(vectors_b, float)
     require(b.ndim == 2 and b.shape[1] == 3, "vectors_b must have shape (n, 3)", b.shape)
     b = np.where(np.isnan(b).any(1, keepdims=True), np.nan, b)
-    off = np.flatnonzero(np.abs(np.linalg.norm(b, axis=1) - 1.0) >= 1e-3)
-    if off.size:
-        raise ValueError(
-            f"vectors_b[{off[0]}] is {b[off[0]]}: directions must be unit vectors, to 1e-3"
-        )
-    if sigma.shape not in ((), (len(b),)):
-        raise ValueError(f"sigma_rad must be a number or of shape ({len(b)},), got {sigma.shape}")
-    if not np.all((sigma > 0.0) & np.isfinite(sigma)):
-        raise ValueError(f"sigma_rad must be positive and finite, got {sigma_rad}")
+    sigma = checked_sigma(sigma_rad, ~np.isnan(b[:, 0]), vectors_b=b)
     light = None if magnitude is None else np.asarray(magnitude, float)
     if light is not None and light.shape != (len(b),):
         raise ValueError(f"magnitude must have shape ({len(b)},), got {light.shape}")

@@ -211,18 +211,8 @@ def attitude_from_vectors(
         raise ValueError(
             f"vectors_b and vectors_i must have one shape (n, 3), got {b.shape} and {r.shape}"
         )
-    sigma = np.asarray(sigma_rad, float)
-    if sigma.shape not in ((), (len(b),)):
-        raise ValueError(f"sigma_rad must be a number or of shape ({len(b)},), got {sigma.shape}")
-    if not np.all((sigma > 0.0) & np.isfinite(sigma)):
-        raise ValueError(f"sigma_rad must be positive and finite, got {sigma_rad}")
-    there = ~np.isnan(b).any(1)
-    for name, v in (("vectors_b", b), ("vectors_i", r)):
-        off = np.flatnonzero(there & ~(np.abs(np.linalg.norm(v, axis=1) - 1.0) < 1e-3))
-        if off.size:
-            raise ValueError(
-                f"{name}[{off[0]}] is {v[off[0]]}: directions must be unit vectors, to 1e-3"
-            )
+    there = np.asarray(~np.isnan(b).any(1))
+    sigma = checked_sigma(sigma_rad, there, vectors_b=b, vectors_i=r)
     rows = -(-max(len(b), 1) // 32) * 32  # so that few shapes are compiled
     filled = np.zeros((2, rows, 3))
     filled[:, : len(b)] = b, r
@@ -236,6 +226,34 @@ def attitude_from_vectors(
             f"apart: got {count}" + (" of less separation" if count > 1 else "")
         )
     return VectorAttitude(*(np.asarray(x) for x in answer))
+
+
+def checked_sigma(
+    sigma_rad: ArrayLike | float, there: np.ndarray, **vectors: np.ndarray
+) -> np.ndarray:
+    """Sigma of directions, a number or (n,), if it and they can be used.
+
+    Args:
+        sigma_rad: as given [rad].
+        there: (n,) bool, the direction is not missing.
+        vectors: (n, 3) directions, by the name of the argument.
+
+    Raises:
+        ValueError: a sigma of another shape or not positive; a direction that is there and not of
+            unit length (to 1e-3).
+    """
+    sigma = np.asarray(sigma_rad, float)
+    if sigma.shape not in ((), there.shape):
+        raise ValueError(f"sigma_rad must be a number or of shape {there.shape}, got {sigma.shape}")
+    sound = np.all((sigma > 0.0) & np.isfinite(sigma))
+    require(sound, "sigma_rad must be positive and finite", sigma_rad)
+    for name, v in vectors.items():
+        off = np.flatnonzero(there & ~(np.abs(np.linalg.norm(v, axis=1) - 1.0) < 1e-3))
+        if off.size:
+            raise ValueError(
+                f"{name}[{off[0]}] is {v[off[0]]}: directions must be unit vectors, to 1e-3"
+            )
+    return sigma
 
 
 class _Solution(NamedTuple):
