@@ -20,6 +20,7 @@ Bounds and weights come from the covariance of the estimates under the fitted no
 
 from __future__ import annotations
 
+from bisect import bisect
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -418,12 +419,10 @@ def _cluster_sizes(clusters: ArrayLike | None, lengths: np.ndarray) -> np.ndarra
 def _longest(lengths: np.ndarray) -> int:
     """Largest cluster size of which stretches long enough for a difference contain enough."""
     # at least half of the steps are no gaps, so there are enough clusters of one sample
-    low, high = 1, int(lengths.sum()) // _FEWEST_CLUSTERS
-    while low < high:
-        m = (low + high + 1) // 2
-        enough = np.sum(lengths[lengths >= 2 * m] // m) >= _FEWEST_CLUSTERS
-        low, high = (m, high) if enough else (low, m - 1)
-    return low
+    larger = range(2, int(lengths.sum()) // _FEWEST_CLUSTERS + 1)
+    return 1 + bisect(
+        larger, -_FEWEST_CLUSTERS, key=lambda m: -int(np.sum(lengths[lengths >= 2 * m] // m))
+    )
 
 
 def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> tuple[float, np.ndarray]:
