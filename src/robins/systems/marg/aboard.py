@@ -87,24 +87,18 @@ class BoardInput(NamedTuple):
     lost_dv: Any  # () m/s
 
 
-def block_of(u: BoardInput) -> model.Block:
-    """Integrate the increments."""
+def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: BoardInput) -> PyTree:
+    """Function of state and block, of the block of these increments."""
     field = jnp.full(jnp.shape(u.theta_b), jnp.nan)
     integrals, _ = model.of_block(model.Samples(u.dt_s, u.theta_b, u.dv_b, field))
-    return model.Block(integrals, u.still, u.lost_turn, u.lost_dv)
-
-
-def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: BoardInput) -> PyTree:
-    return inner(x, block_of(u))
+    return inner(x, model.Block(integrals, u.still, u.lost_turn, u.lost_dv))
 
 
 def model_on_board(parameters: MargReplay) -> Model:
     """Model of `model_of`, with a motion that takes `BoardInput`."""
     known = model.model_of(parameters)
-    step, noise, linear = (
-        Partial(_of_increments, part)
-        for part in (known.motion.step, known.motion.noise, known.motion.linear)
-    )
+    parts = known.motion.step, known.motion.noise, known.motion.linear
+    step, noise, linear = (Partial(_of_increments, part) for part in parts)
     return Model(Motion(step, noise, linear), known.sensors)
 
 

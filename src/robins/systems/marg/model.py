@@ -34,12 +34,12 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import rotation
-from robins.filters import Model, Motion, Sensor
+from robins.filters import Model, Motion
 from robins.manifold import Angle
 from robins.program.scanned import mapped_rows
 from robins.rotation import Rotation, left_jacobian, skew
 from robins.systems.marg.parameters import MargReplay
-from robins.systems.parts import NED
+from robins.systems.parts import NED, seen_by
 from robins.systems.study import SensorAxes, StateBlock
 
 XYZ = ("x", "y", "z")
@@ -211,12 +211,8 @@ def advance_linear(noise: MargNoise, x: MargState, block: Block):
     return advance(noise, x, block), F, _factor(noise, x, block)
 
 
-def _read_travel(x: MargState, _: Array | None):
-    return jnp.concatenate([x.v_n, x.p_n])
-
-
 def _travel_linear(x: MargState, _: Array | None):
-    return _read_travel(x, None), jnp.eye(6, DIM, 3)
+    return jnp.concatenate([x.v_n, x.p_n]), jnp.eye(6, DIM, 3)
 
 
 def _travel_sigma(noise: MargNoise) -> Array:
@@ -224,17 +220,14 @@ def _travel_sigma(noise: MargNoise) -> Array:
     return jnp.repeat(sigma, 3)
 
 
-def _read_rest(x: MargState, seen_b: Array):
+def _rest_linear(x: MargState, seen_b: Array):
     """Velocity and corrected rate, both zero at rest."""
     rate_b = seen_b[:3]
-    return jnp.concatenate([x.v_n, rate_b + x.gyro_gain @ rate_b - x.gyro_bias])
-
-
-def _rest_linear(x: MargState, seen_b: Array):
-    gain = jnp.kron(jnp.eye(3), seen_b[None, :3])
+    read = jnp.concatenate([x.v_n, rate_b + x.gyro_gain @ rate_b - x.gyro_bias])
+    gain = jnp.kron(jnp.eye(3), rate_b[None])
     H = jnp.zeros((6, DIM)).at[0:3, 3:6].set(jnp.eye(3))
     H = H.at[3:6, 9:12].set(-jnp.eye(3)).at[3:6, 12:21].set(gain)
-    return _read_rest(x, seen_b), H
+    return read, H
 
 
 def _rest_sigma(noise: MargNoise, x: MargState, seen_b: Array):
@@ -249,16 +242,13 @@ def _level(x: MargState, field_b: Array):
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0), m
 
 
-def _read_magnetometer(x: MargState, field_b: Array):
+def _magnetometer_linear(x: MargState, field_b: Array):
     strength, m = _level(x, field_b)
     there = strength > 0.0
     azimuth = jnp.arctan2(jnp.where(there, m[1], 0.0), jnp.where(there, m[0], 1.0))
-    return Angle(azimuth - x.declination), jnp.stack([strength, m[2]]) - x.field
-
-
-def _magnetometer_linear(x: MargState, field_b: Array):
+    read = Angle(azimuth - x.declination), jnp.stack([strength, m[2]]) - x.field
     H = jnp.zeros((3, DIM)).at[0, HEADING].set(1.0).at[0, DECLINATION].set(-1.0)
-    return _read_magnetometer(x, field_b), H.at[1:, FIELD].set(-jnp.eye(2))
+    return read, H.at[1:, FIELD].set(-jnp.eye(2))
 
 
 def _magnetometer_sigma(noise: MargNoise, x: MargState, field_b: Array):
@@ -268,15 +258,11 @@ def _magnetometer_sigma(noise: MargNoise, x: MargState, field_b: Array):
     return jnp.stack([azimuth, jnp.asarray(noise.field), jnp.asarray(noise.field)])
 
 
-def _read_site(x: MargState, seen_b: Array):
+def _site_linear(x: MargState, seen_b: Array):
     """Azimuth of the measured field relative to that of a site; `seen_b` is aux of "revisit"."""
     _, m = _level(x, seen_b[:3])
-    return Angle(jnp.arctan2(m[1], m[0]) - seen_b[4:] @ x.azimuths)
-
-
-def _site_linear(x: MargState, seen_b: Array):
     H = jnp.zeros((1, DIM)).at[0, HEADING].set(1.0).at[0, AZIMUTHS].set(-seen_b[4:])
-    return _read_site(x, seen_b), H
+    return Angle(jnp.arctan2(m[1], m[0]) - seen_b[4:] @ x.azimuths), H
 
 
 def _site_sigma(x: MargState, seen_b: Array):
@@ -316,13 +302,13 @@ def model_of(parameters: MargReplay) -> Model:
     )
     noise = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), noise)
     sensors = [
-        Sensor(_read_travel, _travel_sigma(noise), 6, TRAVEL, _travel_linear),
-        Sensor(_read_rest, Partial(_rest_sigma, noise), 6, REST, _rest_linear),
+        seen_by(_travel_linear, _travel_sigma(noise), 6, TRAVEL),
+        seen_by(_rest_linear, Partial(_rest_sigma, noise), 6, REST),
     ]
     if parameters.use_magnetometer != "never":
         sigma = Partial(_magnetometer_sigma, noise)
-        sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
-        sensors.append(Sensor(_read_site, _site_sigma, 1, REVISIT, _site_linear))
+        sensors.append(seen_by(_magnetometer_linear, sigma, 3, MAGNETOMETER))
+        sensors.append(seen_by(_site_linear, _site_sigma, 1, REVISIT))
     motion = Motion(
         step=Partial(advance, noise),
         noise=Partial(_factor, noise),
