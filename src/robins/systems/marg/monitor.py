@@ -132,33 +132,22 @@ def sentences(name: str, doubt: Contradictions, mean: MargState, dt_s: np.ndarra
     out = []
     most = float(np.degrees(np.max(np.abs(np.asarray(mean.declination)), initial=0.0)))
     largest = 100.0 * float(np.max(np.abs(np.asarray(mean.gyro_gain)), initial=0.0))
-    for where, what in (
-        (
-            doubt.declination,
-            f"the field is turned by up to {most:.0f} deg against its mean, beyond three of its "
-            "standard deviations (magnetometer.declination): either the field here bends that "
-            "much, or the heading is wrong by as much",
-        ),
-        (
-            doubt.gain,
-            f"a gain of the gyros is {largest:.1f} %, beyond three of its standard deviations "
-            "(gyro.gain): the gyros are worse than stated, or the gains take up another error, "
-            "and the heading with them",
-        ),
-        (
-            doubt.tilt,
-            "velocity and place do not stay as small as stated (travel.velocity, travel.place), "
-            "or the tilt is wrong: its stated sigma is too small",
-        ),
-        (
-            doubt.refused,
-            "the field was refused ten times in a row or more: the heading came from the gyros "
-            "alone, and may be off by more than is stated",
-        ),
-    ):
+    sentence = {
+        "declination": f"the field is turned by up to {most:.0f} deg against its mean, beyond "
+        "three of its standard deviations (magnetometer.declination): either the field here bends "
+        "that much, or the heading is wrong by as much",
+        "gain": f"a gain of the gyros is {largest:.1f} %, beyond three of its standard deviations "
+        "(gyro.gain): the gyros are worse than stated, or the gains take up another error, "
+        "and the heading with them",
+        "tilt": "velocity and place do not stay as small as stated (travel.velocity, "
+        "travel.place), or the tilt is wrong: its stated sigma is too small",
+        "refused": "the field was refused ten times in a row or more: the heading came from the "
+        "gyros alone, and may be off by more than is stated",
+    }
+    for what, where in doubt._asdict().items():
         seconds = float(np.sum(np.asarray(dt_s)[where]))
         if seconds > _LASTING_S:
-            out.append(f"{name}: for {seconds:.0f} s {what}.")
+            out.append(f"{name}: for {seconds:.0f} s {sentence[what]}.")
     return out
 
 

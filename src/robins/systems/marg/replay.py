@@ -93,14 +93,6 @@ def rms_deg(angle_rad: np.ndarray) -> float:
     return float(np.degrees(np.sqrt(np.mean(angle_rad**2)))) if angle_rad.size else float("nan")
 
 
-class Errors(NamedTuple):
-    """Errors, true minus estimated, at the ends of blocks."""
-
-    heading: np.ndarray  # (B,) rad
-    tilt: np.ndarray  # (B, 2) rad, about north and east
-    counts: np.ndarray  # (B,) bool
-
-
 def contender(parameters: MargReplay, name: str) -> Contender:
     """The filter "marg" with its model.
 
@@ -145,15 +137,15 @@ def replay(
     variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
     truth = None if dataset.attitude is None else truth_at(dataset.attitude, log.time_ns)
     if truth is not None:
-        errors = {name: _errors(*(x[log.rows] for x in (q, *truth))) for name, q in q_nb.items()}
+        errors = {name: _errors(q[log.rows], truth[0][log.rows]) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
 
     def metrics(answer: FilterEstimates) -> dict[str, float | int]:
         share = {"rest_share": float(np.mean(log.still))}
         if truth is None:
             return share
-        moving = errors[answer.name].counts
-        ratio = errors[answer.name].heading[moving] / answer.sigma[moving, 2]
+        moving = truth[1][log.rows]
+        ratio = (errors[answer.name][:, 2] / answer.sigma[:, 2])[moving]
         # one if the stated sigma of the heading is right
         nees = float(np.mean(ratio**2)) if ratio.size else float("nan")
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
@@ -340,25 +332,27 @@ def _accuracy(q_nb: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> dict[
     }
 
 
-def _errors(q: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> Errors:
+def _errors(q: np.ndarray, q_true: np.ndarray) -> np.ndarray:
+    """Errors (B, 3) [rad], true minus estimated: tilt about north and east, and heading."""
     # tilt of the true vertical relative to the estimated one, about estimated north and east
     true_down = rotation.to_dcm(q_true)[:, 2]
     north, east, _ = np.moveaxis(rotation.to_dcm(q), 1, 0)
-    tilt = np.stack([np.sum(east * true_down, axis=1), -np.sum(north * true_down, axis=1)], axis=1)
-    return Errors(-orientation_errors(q, q_true).heading, tilt, counts)
+    tilt = np.sum(east * true_down, axis=1), -np.sum(north * true_down, axis=1)
+    return np.stack([*tilt, -orientation_errors(q, q_true).heading], axis=1)
 
 
 def _error_arrays(
-    answers: Mapping[str, FilterEstimates], errors: Mapping[str, Errors]
+    answers: Mapping[str, FilterEstimates], errors: Mapping[str, np.ndarray]
 ) -> Variables:
     out: dict[str, Any] = {}
-    for block, values, words in (
-        (_HEADING, [e.heading[:, None] for e in errors.values()], "true minus estimated heading"),
-        (_INCLINATION, [e.tilt for e in errors.values()], "tilt of true against estimated"),
+    every = np.stack(list(errors.values()))
+    sigma = np.stack([answer.sigma[:, :3] for answer in answers.values()])
+    for block, words in (
+        (_HEADING, "true minus estimated heading"),
+        (_INCLINATION, "tilt of true against estimated"),
     ):
-        out |= block_array("error", block, np.stack(values), words)
-        sigma = [answer.sigma[:, block.where] for answer in answers.values()]
-        out |= block_array("sigma", block, np.stack(sigma))
+        out |= block_array("error", block, every[..., block.where], words)
+        out |= block_array("sigma", block, sigma[..., block.where])
     return out
 
 
