@@ -17,11 +17,9 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset, model
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.path import InsGnssPath, row_of
-from robins.systems.ins_gnss.positions import heading_of
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
-from robins.systems.ins_gnss.rest import UsualIntervals, usual_of
+from robins.systems.ins_gnss.rest import usual_of
 from robins.systems.ins_gnss.robust import navigation
-from robins.systems.ins_gnss.start import find_start
 from robins.systems.streaming import Flag, LiveError
 
 RATE_HZ, FIX_HZ = 50.0, 2.0
@@ -71,8 +69,8 @@ def epochs_of_replay(dataset, parameters, name):
 
 def vector(n):
     """The numbers of an answer."""
-    wrong = list(n.wrong.values())
-    return np.concatenate([n.q_nb, n.v_n, [n.lat_rad, n.lon_rad, n.alt_m], n.sigma, wrong])
+    place = n.lat_rad, n.lon_rad, n.alt_m
+    return np.concatenate([n.q_nb, n.v_n, place, n.sigma, list(n.wrong.values())])
 
 
 def events(dataset, late_s, skipped=()):
@@ -151,13 +149,15 @@ def test_a_file_of_another_filter_is_refused(live, log, tmp_path):
         LiveInsGnss.load(tmp_path / "old.live")
 
 
+def lateness(order, count):
+    """Delays [s] of the fixes; out of order each comes after the next one."""
+    early, late = {"at once": (0.0, 0.0), "late": (0.17, 0.17), "out of order": (0.1, 0.72)}[order]
+    return np.where(np.arange(count) % 2 == 0, late, early)
+
+
 @pytest.mark.parametrize("order", ["at once", "late", "out of order"])
 def test_epochs_are_those_of_the_replay(live, log, order):
-    count = len(log.gnss)
-    late_s = {"at once": np.zeros(count), "late": np.full(count, 0.17)}.get(order)
-    if late_s is None:  # each comes after the next one
-        late_s = np.where(np.arange(count) % 2 == 0, 0.72, 0.1)
-    answers, at = played(live, log, events(log, late_s))
+    answers, at = played(live, log, events(log, lateness(order, len(log.gnss))))
     stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     started = [not a.flags & Flag.STARTING for a in answers]
@@ -171,10 +171,10 @@ def test_epochs_are_those_of_the_replay(live, log, order):
 def test_sigmas_that_are_too_small_are_doubted_as_in_a_replay(live, log):
     """A late fix, for which steps are repeated, counts once among the innovations judged."""
     sure = replace(log, gnss=replace(log.gnss, sigma_m=0.2 * log.gnss.sigma_m))
-    count, found = len(log.gnss), []
-    for late_s in (np.zeros(count), np.where(np.arange(count) % 2 == 0, 0.72, 0.1)):
+    found = []
+    for late_s in ("at once", "out of order"):
         live.start_over()
-        played(live, sure, events(sure, late_s))
+        played(live, sure, events(sure, lateness(late_s, len(log.gnss))))
         found.append(live.doubts())
     refused = f"measurements of '{model.POSITION}' were refused"
     assert refused in found[0][0]
@@ -398,47 +398,6 @@ def test_a_fix_of_the_future_waits(live, log):
     stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     assert live.counts["steps_again"] == 0
-
-
-def standing(parameters, turn_s=0.0, field_t=None, fixes_s=0.0):
-    """Path of a unit at 50 Hz and its start, if it finds one; it turns by 30 deg/s from 1 s on.
-
-    The first of its fixes, which do not move, comes after a time.
-    """
-    path, noise = InsGnssPath(parameters, UsualIntervals(0.02, 0.5), 1.0), np.random.default_rng(0)
-    for k in range(600):
-        row = [0.0, 0.0, np.pi / 6.0 * (50 < k <= 50 * (1.0 + turn_s)), 0.0, 0.0, -9.8]
-        path.push(np.array([20_000_000 * k]), row + noise.normal(size=(1, 6)) * 1e-4)
-        if field_t is not None:
-            path.push_field(20_000_000 * k, field_t)
-        if k % 25 == 0 and 0.02 * k > fixes_s:
-            velocity = np.zeros(3), np.full(3, 0.05)
-            path.push_fix(row_of(0.02 * k - 0.1, (0.7, 0.1, 100.0), np.ones(3), *velocity, 1))
-        if found := path.start():
-            return found[1]
-    return None
-
-
-@pytest.mark.parametrize("most_s", [600.0, 6.0, 2.0])
-def test_a_given_heading_is_that_of_the_first_sample_also_where_it_is_dropped(monkeypatch, most_s):
-    monkeypatch.setattr("robins.systems.ins_gnss.path._MOST_START_S", most_s)
-    start = standing(HEADED, turn_s=3.0, fixes_s=9.0)
-    turned = heading_of(start.q_nb) - HEADED.start.known_heading
-    assert np.degrees(turned) == pytest.approx(90.0, abs=0.01)
-
-
-def test_a_magnetometer_that_is_refused_is_asked_ever_more_rarely(monkeypatch):
-    asked = []
-
-    def counted(*of):
-        asked.append(float(of[0].time_s[-1]))
-        return find_start(*of)
-
-    monkeypatch.setattr("robins.systems.ins_gnss.path.find_start", counted)
-    monkeypatch.setattr("robins.systems.ins_gnss.path._COURSE_S", 2.0)
-    assert standing(InsGnssReplay(), field_t=np.array([3e-4, 0.0, 0.0])) is None
-    assert 10 < len(asked) < 25  # of 98 times that the start is looked for
-    assert np.all(np.diff(asked)[-3:] > 0.7)
 
 
 def test_samples_that_a_log_is_cleaned_of_are_refused_as_they_come(live, log):

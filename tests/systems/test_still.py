@@ -11,12 +11,16 @@ from robins.dataset import GnssTable
 from robins.earth.magnetic import elements, field_n, wmm
 from robins.ins.increments import Increments
 from robins.ins.rest import moving_statistics, standstill
-from robins.systems.ins_gnss.parameters import Aids, InsGnssStart
+from robins.systems.ins_gnss.parameters import Aids, InsGnssReplay, InsGnssStart
+from robins.systems.ins_gnss.path import InsGnssPath, row_of
+from robins.systems.ins_gnss.positions import heading_of
 from robins.systems.ins_gnss.recording import Log
+from robins.systems.ins_gnss.rest import UsualIntervals
 from robins.systems.ins_gnss.start import find_start, with_heading
 
 G = 9.80
 DT = 0.01
+HEADED = InsGnssReplay.model_validate({"start": {"known_heading": 1.2}})
 
 
 def test_moving_statistics_are_those_of_the_windows():
@@ -118,3 +122,44 @@ def test_a_magnetometer_tells_the_heading_where_no_course_does():
     assert "from the course" in find_start(moving, InsGnssStart(), Aids()).sentence
     with pytest.raises(ValueError, match=r"reads 0\.1 of the Earth's field"):
         find_start(seen._replace(field_b=0.1 * field), InsGnssStart(), Aids())
+
+
+def standing(parameters, turn_s=0.0, field_t=None, fixes_s=0.0):
+    """Path of a unit at 50 Hz and its start, if it finds one; it turns by 30 deg/s from 1 s on.
+
+    The first of its fixes, which do not move, comes after a time.
+    """
+    path, noise = InsGnssPath(parameters, UsualIntervals(0.02, 0.5), 1.0), np.random.default_rng(0)
+    for k in range(600):
+        row = [0.0, 0.0, np.pi / 6.0 * (50 < k <= 50 * (1.0 + turn_s)), 0.0, 0.0, -9.8]
+        path.push(np.array([20_000_000 * k]), row + noise.normal(size=(1, 6)) * 1e-4)
+        if field_t is not None:
+            path.push_field(20_000_000 * k, field_t)
+        if k % 25 == 0 and 0.02 * k > fixes_s:
+            velocity = np.zeros(3), np.full(3, 0.05)
+            path.push_fix(row_of(0.02 * k - 0.1, (0.7, 0.1, 100.0), np.ones(3), *velocity, 1))
+        if found := path.start():
+            return found[1]
+    return None
+
+
+@pytest.mark.parametrize("most_s", [600.0, 6.0, 2.0])
+def test_a_given_heading_is_that_of_the_first_sample_also_where_it_is_dropped(monkeypatch, most_s):
+    monkeypatch.setattr("robins.systems.ins_gnss.path._MOST_START_S", most_s)
+    start = standing(HEADED, turn_s=3.0, fixes_s=9.0)
+    turned = heading_of(start.q_nb) - 1.2
+    assert np.degrees(turned) == pytest.approx(90.0, abs=0.01)
+
+
+def test_a_magnetometer_that_is_refused_is_asked_ever_more_rarely(monkeypatch):
+    asked = []
+
+    def counted(*of):
+        asked.append(float(of[0].time_s[-1]))
+        return find_start(*of)
+
+    monkeypatch.setattr("robins.systems.ins_gnss.path.find_start", counted)
+    monkeypatch.setattr("robins.systems.ins_gnss.path._COURSE_S", 2.0)
+    assert standing(InsGnssReplay(), field_t=np.array([3e-4, 0.0, 0.0])) is None
+    assert 10 < len(asked) < 25  # of 98 times that the start is looked for
+    assert np.all(np.diff(asked)[-3:] > 0.7)
