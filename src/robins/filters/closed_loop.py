@@ -20,7 +20,7 @@ from robins.filters.kalman import WRONG, Filter, FilterState, Updated
 from robins.filters.model import Data, Model, Sensor
 from robins.filters.run import Keep, Step, check_names, everything, nothing, report_run
 from robins.filters.tally import Tally
-from robins.filters.values import as_data, is_known
+from robins.filters.values import as_data, is_known, on_device
 from robins.manifold import State
 
 T = TypeVar("T")
@@ -145,9 +145,8 @@ def run_closed(
     require(len(steps) == 1, "rows and due of a loop must have one length", sorted(steps))
     check_names(model, loop.due)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
-    state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
-    loop = Loop(as_data(loop.react), world, rows, due)
+    state, *arrays = on_device((state, loop.world, loop.rows, loop.due))
+    loop = Loop(as_data(loop.react), *arrays)
     closed = _scan(filter_, model, state, loop, keep)
 
     def again(other: Filter) -> FilterState:

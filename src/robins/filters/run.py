@@ -17,7 +17,7 @@ from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
-from robins.filters.values import is_known, split_numbers, without_weak_types
+from robins.filters.values import is_known, on_device, split_numbers, without_weak_types
 from robins.manifold import State
 
 
@@ -237,7 +237,7 @@ def run(
     rows = u, measurements, extra
     scan = _interpreted
     if machine == "jax":  # not for "vm": JAX compiles a program for each new shape of an array
-        scan, (state, rows) = _scan, jax.tree_util.tree_map(jnp.asarray, (state, rows))
+        scan, (state, rows) = _scan, on_device((state, rows))
     solution = scan(filter_, model, state, rows, keep)
 
     def again(other: Filter) -> FilterState:

@@ -359,7 +359,7 @@ def test_a_second_plant_of_the_same_shape_builds_nothing():
     assert programs.build.cache_info().misses == built
     assert found.h2 == pytest.approx(h2_norm(*error_of(other, found.gain)), rel=1e-12)
     program = programs.build("common", "mixed", 2, 3, 1, 1, 1)
-    assert program.problem.is_dcp(dpp=True)
+    assert program.is_dcp(dpp=True)
 
 
 def error_of(given, K):

@@ -12,7 +12,6 @@ It depends on which components of measurements are present, not on their values.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -27,6 +26,7 @@ from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Data, Model
 from robins.filters.observation import Observation, as_measurement
+from robins.filters.values import on_device
 from robins.manifold import State
 
 Use = ArrayLike | Sequence[bool]  # (S,) bool, sensors of a model that are used
@@ -98,8 +98,7 @@ def linearised(
     Raises:
         ValueError: lengths differ.
     """
-    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
-    truth, mean, u, aux = map(as_arrays, (truth, start.mean, u, dict(aux or {})))
+    truth, mean, u, aux = on_device((truth, start.mean, u, dict(aux or {})))
     before = delayed_by_one(mean, truth)
     measured = {name: as_measurement(name, values) for name, values in y.items()}
     rows = (before, truth, u, measured, aux)

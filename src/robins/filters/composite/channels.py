@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -138,8 +138,7 @@ class JoinedFilter(Composite):
     """
 
     channels: tuple[Channel, ...]
-
-    title: ClassVar[str]
+    title: str = kind()
 
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
         raise NotImplementedError(f"{type(self).__name__} must have `fuse`")

@@ -24,7 +24,7 @@ from robins.filters.belief import Belief, Code, StepInfo, is_failure
 from robins.filters.kalman import Advanced, Around, Filter, FilterState, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.trees import repeated, row_of, select
-from robins.filters.values import kind, value
+from robins.filters.values import kind, on_device, value
 
 T = TypeVar("T")
 _WHOLE = 1e-6  # tolerance of an age as a whole number: the rounding of a ratio of times
@@ -81,15 +81,9 @@ class _Place(NamedTuple):
         return self.used & ~self.at_once
 
 
-class _RepeatedSteps(NamedTuple):
-    """Results of the repeated steps."""
-
-    inner: FilterState
-    before: FilterState  # as in `_StepBuffer`
-    log_likelihood: Array  # as in `_StepBuffer`
-    own: StepInfo  # of the late measurement
-    taken: Array  # bool, all predictions were taken
-    failed: Array  # first failure, a `Code`
+# Of repeated steps: state of the filter; `before` and `log_likelihood` as in `_StepBuffer`; the
+# information of the late measurement; () bool, all predictions were taken; first failure, a `Code`.
+_Repeated = tuple[FilterState, FilterState, Array, StepInfo, Array, Array]
 
 
 @value
@@ -115,12 +109,12 @@ class Delayed(Around):
 
     def begin(self, inner: FilterState, known: Model) -> FilterState:
         """Start with an empty buffer; the present step has no prediction to repeat."""
-        size, extra = self.size, _numbers(self.aux)
+        size, extra = self.size, on_device(self.aux)
         asked = jnp.zeros((size, len(self.names)), bool)
         past = _StepBuffer(
             before=repeated(inner, size),
             moved=jnp.zeros(size, bool),
-            u=repeated(_numbers(self.u), size),
+            u=repeated(on_device(self.u), size),
             y={s.name: repeated(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
             aux=repeated(extra, size),
             asked=asked,
@@ -131,7 +125,7 @@ class Delayed(Around):
         return inner._replace(memory=DelayMemory(inner.memory, past, zero, zero, known))
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return self.begin(self.inner.init(belief, dims), _numbers(self.model))
+        return self.begin(self.inner.init(belief, dims), on_device(self.model))
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         # Earlier measurements are part of the new belief, or meant to be forgotten.
@@ -150,7 +144,7 @@ class Delayed(Around):
         past = self.opened(held.past, now % self.size, inner, u)
         inner, prediction = self.inner.predict(inner, motion, u)
         reach = jnp.minimum(held.reach + 1, self.depth)
-        known = Model(_numbers(motion), held.model.sensors)
+        known = Model(on_device(motion), held.model.sensors)
         new = inner._replace(memory=DelayMemory(inner.memory, past, now, reach, known))
         return new, prediction._replace(transition=None, origin=None)
 
@@ -160,7 +154,7 @@ class Delayed(Around):
         entry = _StepBuffer(
             before=inner,
             moved=jnp.ones((), bool),
-            u=_numbers(u),
+            u=on_device(u),
             y=jax.tree_util.tree_map(lambda a: jnp.full(a.shape[1:], jnp.nan), past.y),
             aux=row_of(past.aux, at),
             asked=none,
@@ -180,9 +174,9 @@ class Delayed(Around):
         inner, info = self.inner.update(_inner(state), sensor, fresh, aux)
         past = _entered(held.past, place, sensor.name, value, aux, info)
         redone = self.redone(past, place, known, inner, info)
-        told = _update_info(past, place, redone)
-        inner = redone.inner
-        past = past._replace(before=redone.before, log_likelihood=redone.log_likelihood)
+        inner, before, gained, own, taken, failed = redone
+        told = _update_info(past, place, gained, own, taken, failed)
+        past = past._replace(before=before, log_likelihood=gained)
         kept = DelayMemory(inner.memory, past, held.now, held.reach, known)
         return inner._replace(memory=kept), told
 
@@ -198,7 +192,7 @@ class Delayed(Around):
         which = names.index(sensor.name)
         _check_same(f"sensor '{sensor.name}'", sensor, model.sensors[which])
         _check_same(f"aux of sensor '{sensor.name}'", aux, self.aux[sensor.name])
-        mine = _numbers(sensor)
+        mine = on_device(sensor)
         sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
         return which, Model(model.motion, sensors)
 
@@ -219,7 +213,7 @@ class Delayed(Around):
 
     def redone(
         self, past: _StepBuffer, place: _Place, known: Model, inner: FilterState, info: StepInfo
-    ) -> _RepeatedSteps:
+    ) -> _Repeated:
         """Repeat the steps from that of the measurement on, if `place.again`."""
         inner = select(place.again, row_of(past.before, place.at), inner)
         fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
@@ -227,12 +221,12 @@ class Delayed(Around):
             0,
             jnp.where(place.again, place.steps + 1, 0),
             lambda i, done: self.step_again(past, place, known, i, done),
-            _RepeatedSteps(inner, past.before, past.log_likelihood, info, *fine),
+            (inner, past.before, past.log_likelihood, info, *fine),
         )
 
     def step_again(
-        self, past: _StepBuffer, place: _Place, known: Model, i: Array, done: _RepeatedSteps
-    ) -> _RepeatedSteps:
+        self, past: _StepBuffer, place: _Place, known: Model, i: Array, done: _Repeated
+    ) -> _Repeated:
         """Repeat the step i steps after that of the measurement."""
         inner, before, gained, own, taken, failed = done
         j = (place.at + i) % self.size
@@ -249,7 +243,7 @@ class Delayed(Around):
             failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
             if k == place.which:
                 own = select(i == 0, seen, own)
-        return _RepeatedSteps(inner, before, gained, own, taken, failed)
+        return inner, before, gained, own, taken, failed
 
 
 def delayed(
@@ -318,12 +312,13 @@ def _entered(
     )
 
 
-def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> StepInfo:
+def _update_info(
+    past: _StepBuffer, place: _Place, gained: Array, own: StepInfo, taken: Array, failed: Array
+) -> StepInfo:
     """Information of an update in its own step, with its effect on all steps so far."""
-    own, again = redone.own, place.again
-    total = jnp.sum(past.log_likelihood), jnp.sum(redone.log_likelihood)
-    added = _change(*total, own, redone.taken)
-    code = _first_failure(own.code, again, redone.failed)
+    again, total = place.again, (jnp.sum(past.log_likelihood), jnp.sum(gained))
+    added = _change(*total, own, taken)
+    code = _first_failure(own.code, again, failed)
     placed = jnp.where(place.used, code, int(Code.REFUSED))
     placed = jnp.where(place.too_old, int(Code.TOO_OLD), placed)
     return own._replace(
@@ -335,10 +330,6 @@ def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> St
 def _inner(state: FilterState) -> FilterState:
     """State of the inner filter."""
     return state._replace(memory=state.memory.inner)
-
-
-def _numbers(tree: T) -> T:
-    return jax.tree_util.tree_map(jnp.asarray, tree)
 
 
 def _plain(tree: Data) -> Data:

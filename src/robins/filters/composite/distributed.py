@@ -62,12 +62,27 @@ FULL = (
 
 @value
 class SideBySide(JoinedFilter):
-    """Local filters with the whole prior and process noise."""
+    """Filter made by `distributed` or `intersecting`: each local has the whole prior and noise."""
 
+    criterion: Criterion | Numbers | None  # or (channels,) weights; None: as if independent
     feedback: Feedback = kind()
+    common: int | None = kind(default=None)  # number of the components that all locals estimate
 
     def first_shares(self, belief: Belief) -> Array:
+        n = belief.factor.shape[0]
+        if self.common is not None and n < self.common:
+            raise ValueError(f"distributed: {self.common} components are common, the state has {n}")
         return jnp.ones((len(self.channels), 1))
+
+    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
+        return disagree(beliefs, i, self.common)
+
+    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
+        if self.criterion is not None:
+            return information_sum(beliefs, intersection_weights(beliefs, self.criterion))
+        if self.common is not None:
+            return common_information_sum(beliefs, common=self.common)
+        return information_sum(beliefs)
 
     def parted(self, belief: Belief, shares: Array) -> list[Belief]:
         return [belief] * len(self.channels)
@@ -86,41 +101,6 @@ class SideBySide(JoinedFilter):
     def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
         motions = [motion] * len(self.channels)
         return self.predict_separately(self.fed_back(state), motions, u, state.memory.shares)
-
-
-@value
-class Distributed(SideBySide):
-    """Filter made by `distributed`."""
-
-    common: int | None = kind()
-
-    title = "distributed"
-
-    def first_shares(self, belief: Belief) -> Array:
-        n = belief.factor.shape[0]
-        if self.common is not None and n < self.common:
-            raise ValueError(f"distributed: {self.common} components are common, the state has {n}")
-        return super().first_shares(belief)
-
-    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
-        return disagree(beliefs, i, self.common)
-
-    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
-        if self.common is None:
-            return information_sum(beliefs)
-        return common_information_sum(beliefs, common=self.common)
-
-
-@value
-class Intersecting(SideBySide):
-    """Filter made by `intersecting`."""
-
-    criterion: Criterion | Numbers  # or (channels,) weights
-
-    title = "intersecting"
-
-    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
-        return information_sum(beliefs, intersection_weights(beliefs, self.criterion))
 
 
 def distributed(
@@ -154,7 +134,7 @@ def distributed(
     if common is not None:
         require(common >= 1, "distributed: at least one component must be common", common)
     owners(channels)
-    return Distributed(tuple(channels), feedback, common)
+    return SideBySide(tuple(channels), "distributed", None, feedback, common)
 
 
 def intersecting(
@@ -180,4 +160,4 @@ def intersecting(
     check_criterion(criterion, len(channels))
     owners(channels)
     given = criterion if isinstance(criterion, str) else number("weights must be real", criterion)
-    return Intersecting(tuple(channels), feedback, given)
+    return SideBySide(tuple(channels), "intersecting", given, feedback)

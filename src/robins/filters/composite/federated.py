@@ -189,8 +189,6 @@ class Federated(JoinedFilter):
     has_master: bool = kind()
     late: bool = kind()  # shared after the prediction
 
-    title = "federated"
-
     @property
     def count(self) -> int:
         """Number of channels."""
@@ -330,7 +328,6 @@ def federated(
             unknown; shares do not sum to one; the mode has no master or no timeout; at `init`, a
             sensor has no channel.
     """
-    channels = tuple(channels)
     owners(channels)
     _check_kinds(mode, sharing, after_prediction)
     within = "the master's share must lie from 0 to below 1"
@@ -342,7 +339,8 @@ def federated(
         raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
     usual = sharing == "root" if after_prediction is None else after_prediction
     return Federated(
-        channels=channels,
+        channels=tuple(channels),
+        title="federated",
         centre=kalman(linearise),
         fixed=fixed,
         master=of_master,

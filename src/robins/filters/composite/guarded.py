@@ -47,6 +47,7 @@ from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
 from robins.filters.kalman import Advanced, Composite, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Motion, Sensor
+from robins.filters.rules._variances import ratio
 from robins.filters.trees import select
 from robins.filters.values import Numbers, kind, number, value
 
@@ -174,7 +175,7 @@ class Guarded(Composite):
         if sensor.name not in self.judging:
             return 0.0
         was, now = before.sigma, after.sigma
-        share = jnp.clip(1.0 - _quotient(now**2, was**2), 0.0, 1.0)
+        share = jnp.clip(1.0 - ratio(now**2, was**2), 0.0, 1.0)
         return jnp.where((dof > 0) & (was > 0.0), share, 0.0)
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
@@ -301,17 +302,11 @@ def _given_out(watch: GuardMemory) -> FilterState:
     return FilterState(Belief(select(w < 1.0, mean, mine.mean), factor), watch)
 
 
-def _quotient(a: Array, b: Array) -> Array:
-    """Ratio a / b; 0 where b is 0, since exactly known components are not tested."""
-    some = b > 0.0
-    return jnp.where(some, a / jnp.where(some, b, 1.0), 0.0)
-
-
 def _difference(mine: Belief, other: Belief) -> tuple[Array, Array]:
     """T and v of each tangent component."""
     variance = other.sigma**2
-    square = _quotient(manifold.local(other.mean, mine.mean) ** 2, variance)
-    gained = jnp.maximum(1.0 - _quotient(mine.sigma**2, variance), 0.0)
+    square = ratio(manifold.local(other.mean, mine.mean) ** 2, variance)
+    gained = jnp.maximum(1.0 - ratio(mine.sigma**2, variance), 0.0)
     return square, gained
 
 

@@ -30,7 +30,7 @@ from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import WRONG, Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Given, Motion, Sensor
 from robins.filters.trees import equal, row_of, select, stack
-from robins.filters.values import Numbers, is_known, kind, value
+from robins.filters.values import Numbers, is_known, kind, on_device, value
 from robins.linalg.rows import each_row
 
 T = TypeVar("T")
@@ -145,9 +145,8 @@ class ModeFamily:
 
         States have a leading axis of modes.
         """
-        numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
         after, found, notes = each_row(
-            lambda row, *part: of(self.of(row), *part), numbers, states, *rows
+            lambda row, *part: of(self.of(row), *part), on_device(self.numbers), states, *rows
         )
         return after, found, [row_of(notes, i) for i in range(self.size)]
 
@@ -161,7 +160,7 @@ class ModeFamily:
 
     def exchanged(self, i: int, filter_: Filter) -> ModeFamily:
         """Copy with another filter in mode i, which may differ in numbers only."""
-        modes = jax.vmap(self.of)(jax.tree_util.tree_map(jnp.asarray, self.numbers))
+        modes = jax.vmap(self.of)(on_device(self.numbers))
         put = jax.tree_util.tree_map(lambda x, new: x.at[i].set(new), modes.filter_, filter_)
         return ModeFamily(_as_mode, replace(modes, filter_=put))
 

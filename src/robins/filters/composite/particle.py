@@ -103,7 +103,10 @@ class Particle(Filter):
 
     def gaussian(self, cloud: ParticleCloud) -> Belief:
         """Gaussian with the moments of the cloud."""
-        return _moments(cloud, self.order(cloud.particles.factor.shape[1])[1])
+        best = row_of(cloud.particles.mean, jnp.argmax(cloud.log_weight))
+        _, k = self.order(cloud.particles.factor.shape[1])  # the first k columns are zero
+        slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
+        return matched(slim, jnp.exp(cloud.log_weight), best)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         n = belief.factor.shape[0]
@@ -279,13 +282,6 @@ def _systematic(key: Array, weight: Array) -> Array:
 
 def _effective(weight: Array) -> Array:
     return 1.0 / jnp.sum(weight**2)
-
-
-def _moments(cloud: ParticleCloud, k: int) -> Belief:
-    """Gaussian with the moments of the cloud; the first k columns of its factors are zero."""
-    best = row_of(cloud.particles.mean, jnp.argmax(cloud.log_weight))
-    slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
-    return matched(slim, jnp.exp(cloud.log_weight), best)
 
 
 def _update_info(

@@ -10,7 +10,7 @@ import warnings
 from functools import lru_cache
 from threading import Lock
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,9 @@ from robins.filters.synthesis.inequalities import Aim
 from robins.filters.synthesis.plant import Plant
 
 if TYPE_CHECKING:
-    import cvxpy
+    from cvxpy import Problem
+else:
+    Problem = Any
 
 Form = Literal["common", "slack", "full"]
 
@@ -44,14 +46,6 @@ class SolverAnswer(NamedTuple):
     unknowns: dict[str, np.ndarray]  # by the symbols of the equations; empty without a solution
 
 
-class DesignProgram(NamedTuple):
-    """Problem with its parameters to set and its unknowns to read."""
-
-    problem: cvxpy.Problem
-    parameters: dict[str, cvxpy.Parameter]
-    unknowns: dict[str, cvxpy.Variable]
-
-
 def solve(plant: Plant, form: Form, aim: Aim) -> SolverAnswer:
     """Solve a design program: "common" is (9) and (10), "slack" their slack form, "full" (6), (7).
 
@@ -64,26 +58,26 @@ def solve(plant: Plant, form: Form, aim: Aim) -> SolverAnswer:
     cp = packages()
     with _LOCK:
         sizes = (*plant.Bw.shape, plant.Bn.shape[1], len(plant.C), len(plant.L))
-        program = build(form, aim, *sizes)
-        for name, parameter in program.parameters.items():
+        problem = build(form, aim, *sizes)
+        for name, parameter in problem.param_dict.items():
             parameter.value = getattr(plant, name)
         try:
             # No warnings, since true norms are checked; no warm start, which keeps the scaling of
             # the first plant.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                program.problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
+                problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
         except cp.SolverError:
             return SolverAnswer("solver_error", np.nan, {})
-        found = {name: unknown.value for name, unknown in program.unknowns.items()}
-        status = str(program.problem.status)
+        found = {name: unknown.value for name, unknown in problem.var_dict.items()}
+        status = str(problem.status)
         if any(value is None or not np.isfinite(value).all() for value in found.values()):
             return SolverAnswer(status, np.nan, {})
-        return SolverAnswer(status, float(program.problem.value), found)  # type: ignore[arg-type]
+        return SolverAnswer(status, float(problem.value), found)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)
-def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> DesignProgram:
+def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Problem:
     """Program for n states, p and q components of w and n, m measurements and r outputs."""
     cp = packages()
     sizes = (n, n), (n, p), (n, q), (m, n), (m, p), (m, q), (r, n)
@@ -91,9 +85,7 @@ def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Desig
     parameters = {name: cp.Parameter(size, name=name) for name, size in named}
     unknowns, matrices = getattr(inequalities, form)(cp, parameters, aim)
     cost = cp.trace(unknowns["H"])
-    problem = cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
-    used = {p.name() for p in problem.parameters()}
-    return DesignProgram(problem, {k: v for k, v in parameters.items() if k in used}, unknowns)
+    return cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
 
 
 def packages() -> ModuleType:

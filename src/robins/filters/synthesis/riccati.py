@@ -41,8 +41,7 @@ def kalman_design(plant: Plant) -> Design:
     """Design of the steady Kalman filter; errors are those of `kalman_gain`."""
     began = time.perf_counter()
     K = kalman_gain(plant)
-    seconds = time.perf_counter() - began
-    return certify(plant, K, method="kalman", lambda_=0.0, seconds=seconds)
+    return certify(plant, K, method="kalman", lambda_=0.0, seconds=time.perf_counter() - began)
 
 
 def inflated_gain(plant: Plant, lambda_: norms.Number) -> np.ndarray:
