@@ -38,7 +38,14 @@ from robins.export.runs import (
     entry_functions,
     reset_function,
 )
-from robins.export.single_precision import PrecisionCost, cost, differences, in_floats
+from robins.export.single_precision import (
+    LEAST,
+    MARGIN,
+    PrecisionCost,
+    cost,
+    differences,
+    in_floats,
+)
 from robins.filters import FilterState
 from robins.filters.composite.adjustable import adjustable
 from robins.filters.model import Data
@@ -49,8 +56,11 @@ from robins.systems.study import Case, Problem
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is measured
 NIS = 1e-7  # tolerance: the square of a small difference of large readings
-MARGIN, LEAST = 4.0, 1e-6  # on differences of floats: other compilers round differently
 RESET = "reset"  # the entry point that restarts the filter
+ENTRIES = {  # arguments after the state, and the sentence that describes an entry point
+    "predict": (("input",), "Propagates the state by one step."),
+    RESET: (("belief",), "Starts again from a belief, all else as by init."),
+}
 
 
 class Request(NamedTuple):
@@ -104,7 +114,7 @@ def files_of(
         "recorded.h": recorded_h(library, record),
         "test.c": check_c(library, record),
         "Makefile": makefile(library),
-        "README.md": page(library, request.filter, request.label, found, MARGIN, LEAST),
+        "README.md": page(library, request.filter, request.label, found),
     }
     return files, library, found
 
@@ -152,13 +162,8 @@ def _library(
 
 def _entry(name: str, program: Program) -> EntryPoint:
     """Entry point with the sentence that describes it."""
-    if name == "predict":
-        return EntryPoint(name, program, ("input",), "Propagates the state by one step.")
-    if name == RESET:
-        return EntryPoint(
-            name, program, ("belief",), "Starts again from a belief, all else as by init."
-        )
-    return EntryPoint(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
+    reading = ("reading", "about"), f"Uses a reading of {name.removeprefix('update_')}."
+    return EntryPoint(name, program, *ENTRIES.get(name, reading))
 
 
 def _any_start(runs: Sequence[BoardRun]) -> FilterState:

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
 
 from robins.export.library import (
     C_TYPES,
@@ -25,6 +24,7 @@ from robins.export.library import (
     Library,
     StructField,
     fields_of,
+    filled,
     number,
     template,
 )
@@ -120,7 +120,7 @@ def _given(
         pairs = zip(entry.takes, given[entry.name], strict=True)
         for j, (argument, tree) in enumerate(pairs, start=1):
             struct = library.argument(entry, argument)
-            for f, leaf in _filled(fields_of(entry.program.inputs, j), tree):
+            for f, leaf in filled(fields_of(entry.program.inputs, j), tree):
                 yield f"{struct}_{f.name}", f, leaf
 
 
@@ -129,23 +129,15 @@ def _made(
 ) -> Iterator[tuple[str, Key, StructField, np.ndarray]]:
     """Table, key, field and numbers of all outputs; leading axis of calls."""
     start = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], library.start)
-    for f, leaf in _filled(library.state, start):
+    for f, leaf in filled(library.state, start):
         yield f"init_state_{f.name}", ("state", f.name), f, leaf
     for entry in library.entries:
         state, result = record.made[entry.name]
-        for f, leaf in _filled(library.state, state):
+        for f, leaf in filled(library.state, state):
             yield f"{entry.symbol}_state_{f.name}", ("state", f.name), f, leaf
         struct = f"{entry.symbol}_result"
-        for f, leaf in _filled(library.result(entry), result):
+        for f, leaf in filled(library.result(entry), result):
             yield f"{struct}_{f.name}", (struct, f.name), f, leaf
-
-
-def _filled(
-    fields: Sequence[StructField], tree: PyTree
-) -> Iterator[tuple[StructField, np.ndarray]]:
-    """Fields and their numbers; empty arrays have no field."""
-    leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
-    return zip(fields, [x for x in leaves if x[0].size], strict=True)
 
 
 def _table(name: str, f: StructField, leaf: np.ndarray, precision: Precision) -> list[str]:
@@ -171,8 +163,7 @@ def check_c(library: Library, record: RecordedSteps) -> str:
     lines += [f"        {call} t);" for entry, call in calls.items() if entry not in record.ends]
     lines += ["    }", *(f"    {calls[entry]} 0);" for entry in record.ends)]
     bits, calls = BITS[library.precision], "\n".join(lines)
-    text = Template(template("check.c")).substitute(name=name, calls=calls, **bits)
-    return "\n".join(part for line in text.split("\n") for part in wrapped(line))
+    return wrapped(Template(template("check.c")).substitute(name=name, calls=calls, **bits))
 
 
 def _called(library: Library, entry: EntryPoint) -> list[str]:

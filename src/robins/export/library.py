@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.filters import Code
 from robins.program.c import function, header, part
@@ -94,6 +95,12 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[StructField]:
             taken.add(name)
             found.append(StructField(name, leaf, slot.first))
     return found
+
+
+def filled(fields: Sequence[StructField], tree: PyTree) -> Iterator[tuple[StructField, np.ndarray]]:
+    """Fields of a struct with their numbers; a leaf without numbers is no field."""
+    leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
+    return zip(fields, [x for x in leaves if x.size], strict=True)
 
 
 def symbol(name: str) -> str:
@@ -197,7 +204,7 @@ class Library(NamedTuple):
         ]
         for entry in self.entries:
             lines += ["", f"/* {entry.about} Returns its code. */", f"{self.signature(entry)};"]
-        return _text([*lines, "", EXTERN_C[1], "", "#endif", ""])
+        return wrapped("\n".join([*lines, "", EXTERN_C[1], "", "#endif", ""]))
 
     def _codes(self) -> list[str]:
         """Result codes as an enumeration."""
@@ -217,11 +224,11 @@ class Library(NamedTuple):
         lines = [f'#include "{self.name}.h"', "", self.programs("static "), *self._init()]
         for entry in self.entries:
             lines += self._entry(entry)
-        return self.headed(_text(lines) + "\n")
+        return self.headed(wrapped("\n".join(lines)) + "\n")
 
     def headed(self, text: str) -> str:
         """A file with the comment for its head."""
-        return f"{_text(self._head())}\n{text}" if self.about else text
+        return wrapped("\n".join(self._head())) + f"\n{text}" if self.about else text
 
     def programs(self, linkage: str = "") -> str:
         """Self-contained C file: the scalars, and the program of each entry point on bare arrays.
@@ -235,10 +242,8 @@ class Library(NamedTuple):
 
     def _init(self) -> list[str]:
         lines = [f"void {self.name}_init({self.name}_state *state)", "{"]
-        leaves = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(self.start)]
         copies = []
-        kept = [leaf for leaf in leaves if leaf.size]
-        for f, value in zip(self.state, kept, strict=True):
+        for f, value in filled(self.state, self.start):
             kind = "real" if f.is_real else C_TYPES[f.leaf.kind]
             entries = ", ".join(
                 number(x, f.is_real, self.precision) for x in value.ravel().tolist()
@@ -282,12 +287,6 @@ def _within(comment: str) -> str:
 def number(value: float | int | np.generic, real: bool, precision: Precision = DOUBLE) -> str:
     """A number in C, to the bit."""
     return precision.number(value) if real else str(int(value))
-
-
-def _text(lines: Sequence[str]) -> str:
-    """Lines as a text; those that are too long are broken."""
-    split = (one for line in lines for one in line.split("\n"))
-    return "\n".join(part for one in split for part in wrapped(one))
 
 
 def _copied(fields: Sequence[StructField], struct: str, inwards: bool) -> list[str]:

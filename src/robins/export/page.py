@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from robins import __version__
 from robins.export.library import Library, template
-from robins.export.single_precision import PrecisionCost
+from robins.export.single_precision import LEAST, MARGIN, PrecisionCost
 from robins.filters import SENTENCES, Code
 
 
-def page(
-    library: Library,
-    name: str,
-    label: str,
-    found: PrecisionCost | None,
-    margin: float,
-    least: float,
-) -> str:
+def page(library: Library, name: str, label: str, found: PrecisionCost | None) -> str:
     """README of an exported folder, in Markdown.
 
     Args:
@@ -23,8 +16,6 @@ def page(
         name: of the filter.
         label: of the problem by which it was tried.
         found: cost of single precision; None in double precision.
-        margin: of the tolerances of the test over the differences that were found.
-        least: smallest tolerance.
     """
     calls = "\n".join(f"    {library.signature(e)};" for e in library.entries)
     codes = "\n".join(f"| {int(code)} | {sentence} |" for code, sentence in SENTENCES.items())
@@ -36,14 +27,14 @@ def page(
         calls=calls,
         codes=codes,
         not_finite=int(Code.NOT_FINITE),
-        costs=_costs(found, margin, least),
+        costs=_costs(found),
     )
 
 
-def _costs(found: PrecisionCost | None, margin: float, least: float) -> str:
+def _costs(found: PrecisionCost | None) -> str:
     """The part of the page on single precision."""
     if found is None:
         return ""
     fails = "" if found.bearable else " It fails, since the filter is ruined."
     text = template("single_precision.md")
-    return text.format(of=found, table=found.table(), margin=margin, least=least, fails=fails)
+    return text.format(of=found, table=found.table(), margin=MARGIN, least=LEAST, fails=fails)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from robins.campaign.machine import first_worlds
 from robins.campaign.monte_carlo import complete_case
-from robins.filters import Belief, Code, Filter, FilterState, Model, StepInfo
+from robins.filters import Belief, Code, Filter, FilterState, Model
 from robins.filters.kalman import WRONG
 from robins.filters.model import Data
 from robins.filters.trees import select
@@ -111,18 +111,12 @@ def entry_functions(
 
         def use(state: FilterState, y: Data, aux: Data):
             state, info = filter_.update(state, sensor, y, aux)
-            return state, _update_result(info)
+            result = info.code, info.nis, info.dof, info.innovation, info.sigma, info.used
+            return state, UpdateResult(*result, info.notes.get(WRONG, ()))
 
         return use
 
     return {n: predict if n == "predict" else update(n.removeprefix("update_")) for n in names}
-
-
-def _update_result(info: StepInfo) -> UpdateResult:
-    wrong = info.notes.get(WRONG, ())
-    return UpdateResult(
-        info.code, info.nis, info.dof, info.innovation, info.sigma, info.used, wrong
-    )
 
 
 def reset_function(filter_: Filter, start: FilterState) -> EntryFunction:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from robins import units
 from robins.campaign.monte_carlo import Blocks, blocks_of, reported_rows
-from robins.export.library import Library, StructField
+from robins.export.library import Library, StructField, filled
 from robins.export.runs import BoardRun, Calls, Kept
 from robins.filters import Belief, FilterState
 from robins.filters.analysis.consistency import normalised_sq
@@ -30,6 +30,7 @@ from robins.systems.study import Contender, Problem
 
 NONE: Mapping[str, float] = {}
 LITTLE, MUCH = 1.01, 1.1  # growth of an RMS or NEES: negligible up to LITTLE, ruin above MUCH
+MARGIN, LEAST = 4.0, 1e-6  # of tolerances over differences: other compilers round differently
 SEVERAL = 0.01  # share of changed codes above which the filter is ruined too
 
 # Code that is called some thousand times is not worth optimising; its bits are the same.
@@ -217,10 +218,8 @@ def differences(
 
     It is relative to the largest number of the field, at least to its ``least``.
     """
-    pairs = zip(*map(jax.tree_util.tree_leaves, (doubles, singles)), strict=True)
-    some = [(a, b) for a, b in pairs if a[0].size]
     found = {}
-    for f, (a, b) in zip(fields, some, strict=True):
+    for (f, a), (_, b) in zip(filled(fields, doubles), filled(fields, singles), strict=True):
         if f.is_real:
             size = np.max(np.abs(a), initial=least.get(f.name, 0.0), where=np.isfinite(a))
             with np.errstate(invalid="ignore"):

@@ -44,8 +44,7 @@ def function(
     x and y hold the reals of arguments and results, k and m all else, in the order of the leaves.
     The results may overlap the arguments: they are written last.
     """
-    lines = _Writer(program, precision).function(name, linkage)
-    return "\n".join(part for line in lines for part in wrapped(line)) + "\n"
+    return wrapped("\n".join(_Writer(program, precision).function(name, linkage))) + "\n"
 
 
 def to_c(program: Program, name: str = "robins_step") -> str:
@@ -99,12 +98,10 @@ class _Writer:
                 whole = read if kind == "whole" else f"whole_of_{kind}({read})"
                 self.lines.append(f"    m[{others}] = {whole};")
                 others += 1
-        unused = [f"    (void){p};" for p, there in self._empty(reals, others) if not there]
+        pools = {POOL[self.graph.kind[n]] for n in live_inputs(self.program)}
+        used = {"x": "x" in pools, "k": "k" in pools, "y": reals > 0, "m": others > 0}
+        unused = [f"    (void){name};" for name, some in used.items() if not some]
         return [head, "{", *unused, *self.lines, "}"]
-
-    def _empty(self, reals: int, others: int) -> list[tuple[str, bool]]:
-        used = {POOL[self.graph.kind[n]] for n in live_inputs(self.program)}
-        return [("x", "x" in used), ("k", "k" in used), ("y", reals > 0), ("m", others > 0)]
 
     def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
         """Write the nodes of a scope, or only some of them."""
@@ -187,7 +184,6 @@ class _Writer:
     def _expression(self, node: Node) -> str:
         """The operation of a node on its arguments."""
         graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
-        kind = graph.kind[args[0]]
         if sign := self._infix(node):
             parts = [self._read(a, bare=True) for a in args]
             return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
@@ -198,13 +194,8 @@ class _Writer:
                 if array in self.strides:
                     return self._at(self.strides[array], graph.kind[node], number)
                 return f"a{array}[{number}]"
-            return f"{graph.kind[node]}_pick(a{array}, {self._read(index)})"
-        name = {
-            "select": f"{graph.kind[node]}_select",
-            "convert": f"{graph.kind[node]}_of_{kind}",
-            "bits": f"{graph.kind[node]}_bits_{kind}",
-        }.get(op, f"{kind}_{op}")
-        return f"{name}({', '.join(map(self._read, args))})"
+            return f"{graph.routine(node)}(a{array}, {self._read(index)})"
+        return f"{graph.routine(node)}({', '.join(map(self._read, args))})"
 
     def _infix(self, node: Node) -> str:
         """The operator of a node, if it is one in C for numbers of its kind."""

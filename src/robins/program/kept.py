@@ -17,12 +17,13 @@ import tempfile
 import time
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from functools import lru_cache
 from importlib import metadata
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -39,6 +40,7 @@ from robins.program.primitives.control import called
 from robins.program.tape import Tape
 from robins.program.walk import Leaf, Program
 
+T = TypeVar("T")
 WORTH = 1_000  # fewest nodes of a program that is kept
 IN_WHEEL = Path(str(files("robins.program"))) / "tapes"  # those of the live filters, by a release
 _BEGAN_S = time.time()  # about when the code of this process was read
@@ -145,6 +147,18 @@ def cached_by_name(
         return program, interpreter.tape(program)
     program, tape, _ = cached_program([what, text], write, interpreter)
     return program, tape
+
+
+def remembered(
+    known: OrderedDict[Hashable, T], key: Hashable, make: Callable[[], T], most: int
+) -> T:
+    """Value by its key, made where it is not known; of more than `most` the oldest is forgotten."""
+    if key not in known:
+        known[key] = make()
+        if len(known) > most:
+            known.popitem(last=False)
+    known.move_to_end(key)
+    return known[key]
 
 
 def second_result(program: Program, function: Callable[..., PyTree], *args: PyTree) -> Tree:

@@ -59,6 +59,7 @@ AXES = {
     **dict.fromkeys(("split", "stack", "cumsum"), "axis"),
     **dict.fromkeys(("concatenate", "sort"), "dimension"),
 }
+SIZES = {"broadcast_in_dim": "shape", "reshape": "new_sizes", "slice": "limit_indices"}
 RANDOM = {"random_bits", "random_split"}
 Named = dict[Variable, Nodes]
 
@@ -287,12 +288,8 @@ class LoopBody:
             if name == "random_split":
                 return [numbered(walk, keys, shape, at)]
             return [bits_of(walk, keys, shape, e.outvars[0].aval.dtype, at)]
-        if name == "broadcast_in_dim":
-            p["shape"] = (1, *p["shape"][1:])
-        elif name == "reshape":
-            p["new_sizes"] = (1, *p["new_sizes"][1:])
-        elif name == "slice":
-            p["limit_indices"] = (1, *p["limit_indices"][1:])
+        if (sizes := SIZES.get(name)) is not None:
+            p[sizes] = (1, *p[sizes][1:])
 
         def one(v: Variable, row: bool) -> Variable:
             if not row:

@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import cached_by_name, second_result
+from robins.program.kept import cached_by_name, remembered, second_result
 from robins.program.kinds import kind_of
 from robins.program.names import Tree
 from robins.program.native import Engine, Step, address
@@ -224,13 +224,9 @@ class NativeState:
         """Bind a function to this memory, enlarging it if needed."""
         forms = [form(x) for x in leaves]
         key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
-        made = _known.get(key)
-        if made is None:
-            made = _known[key] = self._made(key[:-1], function, args)
-            if len(_known) > _MOST:
-                _known.popitem(last=False)
-        _known.move_to_end(key)
-        count, (program, result, step) = len(self._slots), made
+        make = partial(self._made, key[:-1], function, args)
+        program, result, step = remembered(_known, key, make, _MOST)
+        count = len(self._slots)
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
         result_slots, *end = slots(program.results[count:])

@@ -217,6 +217,18 @@ class Graph:
         """True if a node is the number of a round."""
         return self.op[node] == "leaf" and self.value[node][1] < 0
 
+    def routine(self, node: Node) -> str:
+        """Name by which C and the interpreter know the operation of a node with arguments."""
+        op, own, given = self.op[node], self.kind[node], self.kind[self.args[node][0]]
+        match op:
+            case "select" | "pick":
+                return f"{own}_{op}"
+            case "convert":
+                return f"{own}_of_{given}"
+            case "bits":
+                return f"{own}_bits_{given}"
+        return f"{given}_{op}"
+
     def block(
         self, routine: str, sizes: Sequence[int], args: Sequence[Node], count: int
     ) -> list[Node]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from robins.errors import require
 from robins.program.interpreter import interpreter_of_one
-from robins.program.kept import cached_by_name, second_result
+from robins.program.kept import cached_by_name, remembered, second_result
 from robins.program.kinds import is_key
 from robins.program.lanes import KINDS, CompiledRounds
 from robins.program.memory import LIVE_UNROLL, form
@@ -57,16 +57,14 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
     row = [a[0] if length else np.zeros(a.shape[1:], a.dtype) for a in arrays[count:]]
     first, interpreter = [*arrays[:count], *row], interpreter_of_one()
     key = getattr(body, "func", body), content, tree, tuple(map(form, first))
-    made = _known.get(key)
-    if made is None:
+
+    def made() -> Made:
         one = jax.tree_util.tree_unflatten(tree, first)
         write = partial(_written, body, one, count)
         program, tape = cached_by_name("scan", key, write, interpreter)
-        made = _known[key] = program, tape, second_result(program, body, *one)
-        if len(_known) > _MOST:
-            _known.popitem(last=False)
-    _known.move_to_end(key)
-    program, tape, keeps = made
+        return program, tape, second_result(program, body, *one)
+
+    program, tape, keeps = remembered(_known, key, made, _MOST)
     rounds = CompiledRounds(program, length, count, 0, engine=lambda _: interpreter.rounds(tape))
     found = [a[0] for a in rounds(1, [(a, False) for a in arrays])]
     begun, _ = tree.children()

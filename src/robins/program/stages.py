@@ -359,9 +359,9 @@ class StagedFunction:
         known, batches, loops, level = split_stages(flat.eqns, self._takes, engine)
         batched = self._batched = set(level)
         parts = [known, *batches.values(), *loops.values()]
-        wanted = self._wanted(parts)
-        self._named = set(variables(self._makes)) - set(variables(self._makes[: self._of_all]))
         between = {v for p in parts for v in taken_by(p.equations)}
+        wanted = {*variables(self._makes), *between}.__contains__
+        self._named = set(variables(self._makes)) - set(variables(self._makes[: self._of_all]))
         for one in (known, *batches.values()):
             one.connect(batched, wanted)
         for one in loops.values():
@@ -383,11 +383,6 @@ class StagedFunction:
         here = self._batched - (self._named - between)
         takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
         return StageMemory(takes, makes, one.within)
-
-    def _wanted(self, parts: Sequence[ArraySteps | AxisLoop]) -> Callable[[Variable], bool]:
-        """Test for variables that are needed outside of the part that makes them."""
-        out = {*variables(self._makes), *(v for p in parts for v in taken_by(p.equations))}
-        return out.__contains__
 
     @property
     def loops(self) -> list[AxisLoop]:

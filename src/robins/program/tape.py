@@ -138,7 +138,6 @@ class Writer:
         graph, op = self.graph, self.graph.op[node]
         self.scope_of[node] = graph.scope[node]
         args = graph.args[node]
-        kind = graph.kind[args[0]] if args else graph.kind[node]
         match op:
             case "constant" | "leaf" | "after" | "item" | "array":
                 return
@@ -155,17 +154,11 @@ class Writer:
                 scope, _ = graph.value[args[1]]
                 self._write("take", node, listed=graph.args[args[0]], numbers=(scope,))
             case "pick":
-                self._write(f"{graph.kind[node]}_pick", node, args[1], listed=graph.args[args[0]])
-            case "select":
-                self._write(f"{graph.kind[node]}_select", node, *args)
-            case "convert":
-                self._write(f"{graph.kind[node]}_of_{kind}", node, *args)
-            case "bits":
-                self._write(f"{graph.kind[node]}_bits_{kind}", node, *args)
+                self._write(graph.routine(node), node, args[1], listed=graph.args[args[0]])
             case _ if node in self.joined:
                 self._sum(node, self.joined[node])
             case _:
-                self._write(f"{kind}_{op}", node, *args)
+                self._write(graph.routine(node), node, *args)
 
     def _sum(self, node: Node, product: Node) -> None:
         """A sum or difference with a product in it."""

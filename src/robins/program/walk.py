@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jax.extend import core as jex
 from jax.typing import ArrayLike
-from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.program.calls import Calls, results_of
@@ -271,9 +269,3 @@ class JaxprWriter:
         if name in OVERFLOWING:
             found = [self.wrapped(found[0], equation.outvars[0].aval.dtype)]
         return found
-
-    def function(
-        self, function: Callable[..., PyTree], *args: Nodes, like: Sequence[PyTree]
-    ) -> list[Nodes]:
-        """Results of a function of JAX on arrays of nodes, which stand for arrays `like` these."""
-        return self.closed(jax.make_jaxpr(function)(*like), *args)

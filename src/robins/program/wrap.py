@@ -5,7 +5,12 @@ from __future__ import annotations
 COLUMNS = 100
 
 
-def wrapped(line: str) -> list[str]:
+def wrapped(text: str) -> str:
+    """Text of C with its long lines wrapped."""
+    return "\n".join(part for line in text.split("\n") for part in _parts(line))
+
+
+def _parts(line: str) -> list[str]:
     """Break a line of C at spaces, in code after commas, into lines of at most 100 columns."""
     begin = line[: len(line) - len(line.lstrip())]
     lines = []

@@ -135,20 +135,29 @@ def _windows(
     return begin.reshape(*begin.shape, *[1] * len(sizes)) + within, inside
 
 
+def _gather_windows(equation: Equation) -> tuple[SIZES, SIZES, Axes]:
+    """Sizes of the windows of a gather, those that are left in the result, and its axes."""
+    d = equation.params["dimension_numbers"]
+    sizes = tuple(int(n) for n in equation.params["slice_sizes"])
+    gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
+    kept = tuple(n for axis, n in enumerate(sizes) if axis not in gone)
+    return sizes, kept, (d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims)
+
+
+def _window_axes_moved(equation: Equation, found: np.ndarray) -> np.ndarray:
+    """Move the last axes, of a window, to where the primitive puts them."""
+    offsets = [int(k) for k in equation.params["dimension_numbers"].offset_dims]
+    others = [k for k in range(found.ndim) if k not in offsets]
+    return np.moveaxis(found, range(found.ndim), [*others, *offsets])
+
+
 def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Places that a gather reads at known indices; -1 for the fill value outside."""
-    p, d = equation.params, equation.params["dimension_numbers"]
-    sizes = tuple(int(n) for n in p["slice_sizes"])
-    axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
+    sizes, kept, axes = _gather_windows(equation)
     found, inside = _windows(places.shape, sizes, indices, axes)
     if _drops(equation):
         found = np.where(inside.reshape(*inside.shape, *[1] * len(sizes)), found, -1)
-    gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
-    batches = inside.ndim
-    found = found.squeeze(tuple(batches + axis for axis in gone))
-    offsets = [int(k) for k in d.offset_dims]
-    others = [k for k in range(found.ndim) if k not in offsets]
-    return np.moveaxis(found, range(found.ndim), [*others, *offsets])
+    return _window_axes_moved(equation, found.reshape(*inside.shape, *kept))
 
 
 def _updates(equation: Equation, rank: int, new: Nodes) -> tuple[Nodes, SIZES, Axes]:
@@ -183,14 +192,10 @@ def _gather(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes) -> 
     if known is not None:
         at = gathered(equation, known, np.arange(a.size).reshape(a.shape))
         return np.append(a, walk.constants(filling(equation)))[at]
-    p, d = equation.params, equation.params["dimension_numbers"]
-    sizes = tuple(int(n) for n in p["slice_sizes"])
-    gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
-    kept = tuple(n for axis, n in enumerate(sizes) if axis not in gone)
+    sizes, kept, axes = _gather_windows(equation)
     batches = indices.shape[:-1]
     found = np.zeros((*batches, *kept), dtype=np.int64)
     outside = walk.constants(filling(equation)).item()
-    axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
     for batch in np.ndindex(*batches):
         start = _starts(walk, indices, batch, a.ndim, axes)
         one = window(walk, a, start, sizes).reshape(kept)
@@ -198,11 +203,7 @@ def _gather(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes) -> 
             inside = _inside(walk, start, a.shape, sizes)
             one = walk.select(np.full(kept, inside), one, np.full(kept, outside))
         found[batch] = one
-    # The axes of a window go where the primitive puts them, those of the indices to the other
-    # places.
-    offsets = [int(k) for k in d.offset_dims]
-    others = [k for k in range(found.ndim) if k not in offsets]
-    return np.moveaxis(found, range(found.ndim), [*others, *offsets])
+    return _window_axes_moved(equation, found)
 
 
 def filling(equation: Equation) -> np.ndarray:

@@ -10,7 +10,7 @@ from robins.program.kinds import Equation
 from robins.program.walk import JaxprWriter, Nodes, rule
 
 # Primitives that are one function of NumPy, of their parameters and arrays.
-OF_NUMPY: dict[str, Callable[..., Nodes]] = {
+OF_NUMPY: dict[str, Callable[..., Nodes | list[Nodes]]] = {
     "reshape": lambda p, a: a.reshape(p["new_sizes"]),
     "transpose": lambda p, a: a.transpose(p["permutation"]),
     "squeeze": lambda p, a: a.squeeze(tuple(p["dimensions"])),
@@ -18,12 +18,14 @@ OF_NUMPY: dict[str, Callable[..., Nodes]] = {
     "concatenate": lambda p, *arrays: np.concatenate(arrays, axis=p["dimension"]),
     "stack": lambda p, *arrays: np.stack(arrays, axis=p["axis"]),
     "tile": lambda p, a: np.tile(a, p["reps"]),
+    "split": lambda p, a: np.split(a, np.cumsum(p["sizes"])[:-1], axis=p["axis"]),
+    "unstack": lambda p, a: list(map(np.asarray, np.moveaxis(a, p["axis"], 0))),
     "rev": lambda p, a: np.flip(a, tuple(p["dimensions"])),
 }
 
 
 @rule(*OF_NUMPY)
-def _moved(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
+def _moved(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes | list[Nodes]:
     return OF_NUMPY[equation.primitive.name](equation.params, *arrays)
 
 
@@ -42,14 +44,6 @@ def _slice(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     p = equation.params
     strides = p["strides"] or (1,) * a.ndim
     return a[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
-
-
-@rule("split", "unstack")
-def _split(walk: JaxprWriter, equation: Equation, a: Nodes) -> list[Nodes]:
-    if equation.primitive.name == "unstack":
-        return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
-    ends = np.cumsum(equation.params["sizes"])[:-1]
-    return np.split(a, ends, axis=equation.params["axis"])
 
 
 @rule("iota")
