@@ -134,3 +134,26 @@ def test_a_named_format_overrides_recognition(three):
 def test_sets_of_files_that_make_no_dataset(three, names, formats, message):
     with pytest.raises(LogError, match=message):
         load_dataset([three[n] for n in names], formats=formats)
+
+
+@pytest.mark.parametrize(
+    ("start", "kind"),
+    [
+        (b"PAR1", "a Parquet file,"),
+        (b"\x89HDF\r\n\x1a\n", "an HDF5 file,"),
+        (b"MATLAB 5.0 MAT-file", "a MATLAB file,"),
+        (b"\x93NUMPY", "an array of NumPy,"),
+    ],
+)
+def test_a_damaged_archive_is_refused_by_its_kind(tmp_path, start, kind):
+    path = tmp_path / "log.bin"
+    path.write_bytes(start + bytes(400))
+    with pytest.raises(LogError, match=f"is {kind} cut short or damaged after"):
+        open_log(path)
+
+
+def test_a_text_is_no_archive(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t, a\n0, 1\n")
+    with pytest.raises(LogError, match="is no archive, or one cut short or damaged after"):
+        open_log(path, "broad-npz")
