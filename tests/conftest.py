@@ -147,7 +147,8 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(config, items):
     tiers.mark(items, not any("::" in arg for arg in config.args))
-    items[:], others = tiers.arrange(items, os.environ.get("PART", "1/1"))
+    first = tiers.first_files() if "CERTIFICATE" in os.environ else ()
+    items[:], others = tiers.arrange(items, os.environ.get("PART", "1/1"), first)
     config.hook.pytest_deselected(items=others)
 
 

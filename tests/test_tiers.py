@@ -30,7 +30,7 @@ def defined(name):
 
 @pytest.mark.parametrize("entry", tiers.certified(), ids=lambda e: e["test"])
 def test_what_is_moved_is_there_and_something_stands_for_it(entry):
-    assert set(entry) <= {"test", "only", "promise", "stands"}
+    assert set(entry) <= {"test", "only", "promise", "stands", "first"}
     assert defined(entry["test"])
     assert entry["promise"].endswith(".")
     assert entry["stands"]
@@ -109,6 +109,10 @@ def test_parts_hold_every_test_once_in_whole_files_and_cost_alike():
     spent = [sum(file.values()) for file in files]
     largest = max(cost for file in files for cost in file.values())
     assert max(spent) <= max(1.1 * min(spent), largest)
+    last = tiers.arrange(items)[0][-1]
+    file = last.nodeid.partition("::")[0]
+    ordered, _ = tiers.arrange(items, first={file.removeprefix("tests/")})
+    assert ordered[0].nodeid.startswith(file)
 
 
 def test_tiers_are_not_marked_by_hand():

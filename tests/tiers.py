@@ -19,6 +19,7 @@ import re
 import subprocess
 import time
 import tomllib
+from collections.abc import Collection
 from datetime import date
 from pathlib import Path
 
@@ -36,8 +37,13 @@ def plain(node: str) -> str:
 
 
 def certified() -> list[dict[str, str]]:
-    """Entries of `certify.toml`: test, promise, stands."""
+    """Entries of `certify.toml`: test, promise, stands, and ``first`` of what takes minutes."""
     return tomllib.loads(CERTIFY.read_text("utf-8"))["moved"]
+
+
+def first_files() -> set[str]:
+    """Files with which the workers of `make certify` begin, so that they end together."""
+    return {entry["test"].partition("::")[0] for entry in certified() if "first" in entry}
 
 
 def costs() -> dict[str, float]:
@@ -88,12 +94,12 @@ def mark(items: list[pytest.Item], whole: bool = True) -> None:
 
 
 def arrange(
-    items: list[pytest.Item], part: str = "1/1"
+    items: list[pytest.Item], part: str = "1/1", first: Collection[str] = ()
 ) -> tuple[list[pytest.Item], list[pytest.Item]]:
     """The items of a part, of "2/4" the second of four, and those of the other parts.
 
-    Costly files come first, so that workers end together. A file stays whole; each goes to the part
-    that has least to do.
+    Costly files come first, before them those of ``first``, so that workers end together. A file
+    stays whole; each goes to the part that has least to do.
     """
     costly, spent = costs(), dict[str, float]()
     for node in dict.fromkeys(plain(item.nodeid.removeprefix("tests/")) for item in items):
@@ -101,7 +107,7 @@ def arrange(
         spent[file] = spent.get(file, 0.0) + costly.get(node, budget.LEAST_S / 4)
     mine, parts = (int(n) for n in part.split("/"))
     load, place = [0.0] * parts, dict[str, tuple[int, int]]()
-    for rank, file in enumerate(sorted(spent, key=lambda f: -spent[f])):
+    for rank, file in enumerate(sorted(spent, key=lambda f: (f not in first, -spent[f]))):
         least = load.index(min(load))
         load[least] += spent[file]
         place[file] = least, rank
