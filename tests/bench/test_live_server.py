@@ -76,7 +76,7 @@ def frames(page, many: int, within_s: float = 5.0) -> list[bytes]:
     until = time.monotonic() + within_s
     while len(found) < many and time.monotonic() < until:
         try:
-            got = page.recv(timeout=0.5)
+            got = page.recv(timeout=min(0.5, within_s))
         except TimeoutError:
             continue
         if isinstance(got, bytes) and not is_history(got):
@@ -332,8 +332,8 @@ def test_memory_of_the_server_stays_constant(shared):
             for k in range(1500 * block, 1500 * (block + 1)):
                 shared.push(0.1 * k, [float(k), 1.0, 1.0])
                 shared.event("info", 0.1 * k, f"event {k} " * 200)  # 2 kB
-                if k % 100 == 99:
-                    frames(page, 100)
+                if k % 100 == 99:  # the server drops samples: not all of them come
+                    frames(page, 100, within_s=0.2)
             sizes.append(resident_kb())
     assert sizes[-1] < 1.1 * sizes[0]
 
