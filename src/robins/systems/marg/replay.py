@@ -20,6 +20,7 @@ from robins.dataset import AttitudeTable, Dataset
 from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
 from robins.errors import require_known
 from robins.filters import Code
+from robins.filters.tally import FEWEST
 from robins.filters.values import Numbers
 from robins.ins.frames import to_ned_frd
 from robins.results import Outcome, Progress, Variables, array, ignore_progress, variable
@@ -151,7 +152,8 @@ def replay(
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
     lasted = np.asarray(log.world.u.samples.dt_s)
-    warned = monitor.of_samples(log.counts, len(log.time_ns))
+    looks, disturbed = _looks(log, answers)
+    warned = disturbed + monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
         warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
     predictions = next(iter(answers.values())).tally.counts()
@@ -163,7 +165,7 @@ def replay(
         metrics=metrics,
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
-        notes=[*_sentences(log, answers), *_looks(log, answers), *_about_north(dataset, north)],
+        notes=[*_sentences(log, answers), *looks, *_about_north(dataset, north)],
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
@@ -419,9 +421,14 @@ def _turned_from_to(log: PreparedMargLog, answer: FilterEstimates) -> str:
     return f"{answer.name}: {', '.join(said)}."
 
 
-def _looks(log: PreparedMargLog, answers: Mapping[str, FilterEstimates]) -> list[str]:
-    """Sentences on refused looks at the field; `replaying.outcome` warns of more than a third."""
-    notes = []
+def _looks(
+    log: PreparedMargLog, answers: Mapping[str, FilterEstimates]
+) -> tuple[list[str], list[str]]:
+    """Sentences on refused looks at the field: notes, and warnings where they are a third or more.
+
+    Where there are `FEWEST` looks or more, `replaying.outcome` warns of the share.
+    """
+    notes, warned = [], []
     for name, answer in answers.items():
         refused = _refused(log, answer)
         update, count = answer.updates.get(model.MAGNETOMETER), int(np.sum(refused))
@@ -429,8 +436,9 @@ def _looks(log: PreparedMargLog, answers: Mapping[str, FilterEstimates]) -> list
         if looked and not count:
             notes.append(f"{name}: the field was undisturbed at all {looked} looks.")
         elif looked:
-            notes.append(
+            unjudged = looked < FEWEST and count >= looked / 3
+            (warned if unjudged else notes).append(
                 f"{name}: the field was disturbed at {count} of {looked} looks; heading "
                 "then came from the gyros."
             )
-    return notes
+    return notes, warned
