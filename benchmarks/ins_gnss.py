@@ -78,7 +78,7 @@ def pyins_run(d):
 def main():
     d = drive()
     problem = SYSTEM.studies["drive"].problem(d, ("ekf",), 0)
-    samples = int(np.sum(np.asarray(problem.simulate.args[1].blocks.increments.dt) > 0))
+    samples = int(np.sum(np.asarray(problem.simulate.args[1].blocks.dt) > 0))
     peer, peer_samples = pyins_run(d)
     case = jax.jit(problem.simulate)(jnp.asarray(0))
     cases = jax.jit(jax.vmap(problem.simulate))(jnp.arange(BATCH))

@@ -60,7 +60,7 @@ def test_a_wrong_filter_is_caught():
 
 def test_the_truth_of_the_epochs_is_that_of_the_motion():
     course = lay_out(parsed())
-    k = course.motion.at(course.blocks.epoch_s)
+    k = course.motion.at(course.epoch_s)
     np.testing.assert_allclose(course.truth.position.lat, k.lat, rtol=0, atol=1e-10)
     np.testing.assert_allclose(course.truth.v_n, k.v_n, rtol=0, atol=1e-8)
     np.testing.assert_allclose(course.truth.position.alt, k.alt, rtol=0, atol=1e-3)

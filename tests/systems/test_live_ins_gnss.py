@@ -238,7 +238,7 @@ def chunked(dataset, parameters, size):
     for at in range(0, len(imu), size):
         rows = slice(at, at + size)
         path.push(imu.time_ns[rows], np.hstack([imu.gyro[rows], imu.accel[rows]]))
-        while arrived < len(dataset.gnss) and dataset.gnss.time_ns[arrived] <= path.time_ns[-1]:
+        while arrived < len(dataset.gnss) and dataset.gnss.time_ns[arrived] <= path.imu.time_ns[-1]:
             time_ns, *fix = row_of_fix(dataset.gnss, arrived)
             path.push_fix(row_of(path.seconds(time_ns), *fix))
             arrived += 1
@@ -343,7 +343,7 @@ def test_an_outage_is_bridged_as_the_replay_does(live, log):
 def test_bad_fixes_and_samples_are_refused_and_counted(live, log):
     whole = events(log, np.full(len(log.gnss), 0.1))
     played(live, log, whole[:600])
-    t, k = int(live._path.time_ns[-1]), next(e[2] for e in whole[600:] if e[1])
+    t, k = int(live._path.imu.time_ns[-1]), next(e[2] for e in whole[600:] if e[1])
     g = log.gnss
     place, sigma = (float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])), g.sigma_m[k]
     before = live.epoch

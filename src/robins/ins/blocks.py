@@ -9,23 +9,14 @@ split there, so that every measurement is applied to the state at its own time.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.ins.frames import turned
 from robins.ins.increments import Increments
-
-
-class Blocks(NamedTuple):
-    """Increments grouped by epoch."""
-
-    increments: Increments  # dt (E, K), theta (E, K, 3), dv (E, K, 3); padded with zeros
-    epoch_s: np.ndarray  # (E,) time at the end of each block
-    duration_s: np.ndarray  # (E,) s, duration of each block
-    parent: np.ndarray  # (E, K) index of the increment of each piece; -1 where padded
 
 
 def epochs_between(
@@ -57,6 +48,25 @@ def epochs_between(
     return np.concatenate(out) if out else np.zeros(0)
 
 
+def due_epochs(
+    known_s: float, time_s: float, wanted_s: float, measured_s: np.ndarray, longest_s: float
+) -> list[tuple[float, float]]:
+    """Epochs after `time_s` that later measurements cannot change, each with its `wanted_s`.
+
+    Args:
+        known_s: up to where samples and measurements are known.
+        time_s: the last epoch.
+        wanted_s: the last measurement up to there, or the start; blocks are counted from it.
+        measured_s: (M,) increasing times of measurements.
+        longest_s: longest block.
+    """
+    # one block further, whose end is not an epoch
+    edges = epochs_between(wanted_s, known_s + longest_s, measured_s, longest_s, even=False)
+    edges = edges[(edges > time_s) & (edges <= known_s)]
+    wanted = np.where(np.isin(edges, measured_s), edges, wanted_s)
+    return list(zip(edges.tolist(), np.maximum.accumulate(wanted).tolist(), strict=True))
+
+
 def usual_width(longest_s: float, usual_s: float) -> int:
     """Number of pieces in the longest block at the usual interval, with some to spare."""
     return -(-math.ceil(1.1 * longest_s / usual_s + 2.0) // 8) * 8
@@ -86,7 +96,7 @@ def _shares(
 
 def cut(
     increments: Increments, time_s: np.ndarray, start_s: float, epoch_s: np.ndarray, least: int = 8
-) -> Blocks:
+) -> tuple[Increments, np.ndarray]:
     """Group increments by epoch, splitting those that contain an epoch.
 
     A split increment is divided in proportion to time, at a constant rate within it; the second
@@ -100,6 +110,10 @@ def cut(
         epoch_s: (E,) end of each block, increasing.
         least: pad every block to this many pieces, or to the longest block, rounded up to a
             multiple of 8 so that logs of like rate share a compilation.
+
+    Returns:
+        dt (E, K), theta (E, K, 3) and dv (E, K, 3), padded with zeros, and (E, K) the index of the
+        increment of each piece, -1 where padded.
 
     Raises:
         ValueError: the increments do not cover (start_s, last epoch].
@@ -132,8 +146,7 @@ def cut(
     out_theta[block, column] = piece_theta
     out_dv[block, column] = piece_dv
     out_parent[block, column] = parent
-    duration = np.diff(epoch_s, prepend=start_s)
-    return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
+    return Increments(out_dt, out_theta, out_dv), out_parent
 
 
 def reach_of_rate(usual_s: float) -> float:
@@ -165,6 +178,61 @@ def rate_about(
     return total / length[:, None]
 
 
+_Piece = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, SciRotation]
+
+
+def _backwards(
+    increments: Increments, time_s: np.ndarray, begin_s: np.ndarray, end_s: np.ndarray
+) -> Iterator[_Piece]:
+    """Pieces of increments in windows (begin, end], the latest first.
+
+    Yields:
+        (E,) row of the increment, share of it in the window, length [s] and middle [s] of that
+        part, and the turn from the axes at its start to those at the end of the window.
+    """
+    sample = np.searchsorted(time_s, end_s - _SLACK_S)
+    turn = SciRotation.identity(len(end_s))
+    while True:
+        inside = (sample >= 0) & (sample < len(time_s))
+        k = np.clip(sample, 0, len(time_s) - 1)
+        end = np.minimum(time_s[k], end_s)
+        begin = np.maximum(time_s[k] - increments.dt[k], begin_s)
+        length = np.where(inside, np.maximum(end - begin, 0.0), 0.0)
+        if not np.any(length > 0.0):
+            return
+        share = length / increments.dt[k]
+        # dv is in the axes at the start of its interval, so its rotation comes first
+        turn = turn * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
+        yield k, share, length, 0.5 * (begin + end), turn
+        sample = sample - 1
+
+
+def mean_rate(
+    increments: Increments, time_s: np.ndarray, begin_s: np.ndarray, end_s: np.ndarray
+) -> np.ndarray:
+    """Mean gyro rate (E, 3) [rad/s] over windows (begin, end] [s] that the increments cover."""
+    total = np.zeros((len(end_s), 3))
+    for row, share, *_ in _backwards(increments, time_s, begin_s, end_s):
+        total += share[:, None] * increments.theta[row]
+    return total / (end_s - begin_s)[:, None]
+
+
+def gained_between(
+    increments: Increments, time_s: np.ndarray, begin_s: np.ndarray, end_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn (E, 3) [rad] and velocity gained (E, 3) [m/s] over windows (begin, end] [s].
+
+    The turn is a rotation vector, the velocity the integral of the specific force in the body axes
+    at the end.
+    """
+    gained, back = np.zeros((len(end_s), 3)), np.zeros((len(end_s), 3))
+    for row, share, length, _, turn in _backwards(increments, time_s, begin_s, end_s):
+        gained += turned(turn.as_matrix(), share[:, None] * increments.dv[row])
+        # not beyond the own window: a further turn by zero may round
+        back = np.where(length[:, None] > 0.0, turn.as_rotvec(), back)
+    return -back, gained
+
+
 def gained_in_window(
     increments: Increments, time_s: np.ndarray, at_s: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -186,20 +254,8 @@ def gained_in_window(
     gained, age = np.zeros((len(at_s), 3)), np.zeros(len(at_s))
     if window_s <= 0.0:
         return gained, age
-    sample = np.searchsorted(time_s, at_s - 1e-9)
-    turn = SciRotation.identity(len(at_s))  # from the axes of the sample to those at t
-    while True:
-        inside = sample >= 0
-        k = np.clip(sample, 0, len(time_s) - 1)
-        end = np.minimum(time_s[k], at_s)
-        begin = np.maximum(time_s[k] - increments.dt[k], at_s - window_s)
-        length = np.where(inside, np.maximum(end - begin, 0.0), 0.0)
-        if not np.any(length > 0.0):
-            return gained, age
-        share = length / increments.dt[k]
-        weight = 1.0 - (at_s - 0.5 * (begin + end)) / window_s
-        # dv is in the axes at the start of its interval, so its rotation comes first
-        turn = turn * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
-        gained += (weight * share)[:, None] * turned(turn.as_matrix(), increments.dv[k])
+    for row, share, length, middle_s, turn in _backwards(increments, time_s, at_s - window_s, at_s):
+        weight = 1.0 - (at_s - middle_s) / window_s
+        gained += (weight * share)[:, None] * turned(turn.as_matrix(), increments.dv[row])
         age += weight * length
-        sample = sample - 1
+    return gained, age

@@ -252,6 +252,52 @@ def own_intervals(
     return own
 
 
+_CONTEXT = 3  # samples that an increment needs before its last
+
+
+class IncrementStream:
+    """Increments of samples of rate and specific force that arrive in chunks.
+
+    An increment is final when the next sample is known; any chunks give the same bits. Rows (8,)
+    are end [s] after the first sample, dt, theta and dv.
+
+    Attributes:
+        origin_ns: stamp of the first sample.
+        time_ns: (M,) stamps of the last samples; empty before the first.
+        newest: (1, 8) the last increment, which the next sample changes; (0, 8) before it.
+    """
+
+    def __init__(self, usual_s: float):
+        """Create a stream without samples, of a sensor with this sampling interval [s]."""
+        self._usual_s, self._has_final = usual_s, False
+        self.origin_ns, self.time_ns = 0, np.zeros(0, np.int64)
+        self._raw, self.newest = np.zeros((0, 6)), np.zeros((0, 8))
+
+    def push(self, time_ns: np.ndarray, samples: np.ndarray) -> np.ndarray:
+        """Add samples; return the rows (K, 8) that have become final.
+
+        Args:
+            time_ns: (M,) int64, increasing.
+            samples: (M, 6) gyro [rad/s] and accel [m/s^2] in body axes.
+        """
+        if not len(self.time_ns):
+            self.origin_ns = int(time_ns[0])
+        self.time_ns = np.concatenate([self.time_ns[-_CONTEXT:], time_ns])
+        self._raw = np.concatenate([self._raw[-_CONTEXT:], samples])
+        if len(self._raw) < 2:
+            return self.newest
+        table = ImuTable(self.time_ns, self._raw[:, :3], self._raw[:, 3:], "rate")
+        made, end_ns = from_imu(table, self._usual_s)
+        ends = (end_ns - self.origin_ns) * 1e-9
+        found = np.column_stack([ends, *(np.asarray(a, float) for a in made[:3])])
+        self.newest = found[-1:]
+        if len(self._raw) <= _CONTEXT:  # later samples change all increments
+            return found[:0]
+        final = found[1 if self._has_final else 0 : -1]
+        self._has_final = True
+        return final
+
+
 def joined(increments: Increments) -> Increments:
     """Join K successive increments into one: dt (), theta, dv and dr (3,), by
 

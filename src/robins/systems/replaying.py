@@ -27,12 +27,13 @@ from robins.filters.kalman import WRONG
 from robins.filters.run import Keep, Solution, Step, everything
 from robins.filters.tally import correlated_band
 from robins.filters.whiteness import joined
-from robins.ins.blocks import Blocks
-from robins.ins.increments import after_gap
+from robins.ins.blocks import cut, usual_width
+from robins.ins.increments import Increments, after_gap
 from robins.program import BuildError, ProgramError
 from robins.program.scanned import mapped_rows
 from robins.results import Outcome, Progress, ignore_progress, variable
 from robins.systems.judgement import Metric
+from robins.systems.parts import ImuBlock, LogPartition
 from robins.systems.study import Case, Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
 from robins.systems.tables import (
@@ -131,17 +132,32 @@ def prepare_pieces(
     return found, problems
 
 
-def noise_scale(
-    blocks: Blocks, dt_s: np.ndarray, across_gap: float, usual_s: float | None = None
-) -> np.ndarray:
-    """Process noise factor (E,): 1, or `across_gap` in a block in which samples are missing.
+def imu_blocks(
+    increments: Increments,
+    time_s: np.ndarray,
+    begin_s: float,
+    epochs: np.ndarray,
+    partition: LogPartition,
+    usual_s: float,
+    spare: int = 0,
+) -> ImuBlock:
+    """Blocks (E, K) from epoch to epoch, and factors (E,) on their process noise.
 
-    The blocks are made of increments of durations `dt_s` (N,), nominally `usual_s`, which is
-    found from them if not given.
+    Args:
+        increments: dt (N,), theta (N, 3), dv (N, 3).
+        time_s: (N,) end of each.
+        begin_s: s, beginning of the first block.
+        epochs: (E,) s, end of each block.
+        partition: of its `longest_block` the width K follows; `gap_noise` is the factor where
+            samples are missing.
+        usual_s: s, sampling interval.
+        spare: increments by which K is larger.
     """
-    gap = after_gap(dt_s, usual_s)
-    missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
-    return np.where(missing, across_gap, 1.0)
+    width = usual_width(partition.longest_block, usual_s) + spare
+    pieces, parent = cut(increments, time_s, begin_s, epochs, least=width)
+    gap = after_gap(np.asarray(increments.dt), usual_s)
+    missing = np.any(gap[parent] & (parent >= 0), axis=1)
+    return ImuBlock(pieces, np.where(missing, partition.gap_noise, 1.0))
 
 
 def gap_counts(pieces: Sequence[LogPiece], problems: Sequence[str]) -> dict[str, int]:

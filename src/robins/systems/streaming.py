@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from enum import IntFlag
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,10 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from robins.errors import RobinsError
-from robins.filters import Belief, Filter, FilterState, Model, OnlineFilter
+from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilter
+from robins.filters.kalman import WRONG
+from robins.filters.online import WatchedStep
+from robins.filters.run import Step
 from robins.ins.plausible import (
     ACCEL_LIMIT,
     FASTEST,
@@ -66,6 +69,51 @@ class Flag(IntFlag):
     DOUBTFUL = 32  # states or innovations contradict the assumptions
     BEHIND = 64  # the filter waits for later samples; the gyros propagate
     OUTLIER = 128  # the filter refused a measurement of its last step, or of one for this answer
+
+
+class MeasurementOutcome(NamedTuple):
+    """Outcome of a measurement in the filter."""
+
+    code: Code
+    nis: float  # normalised innovation squared
+    dof: int  # components that were measured
+
+
+def watched(step: Step, vector: jax.Array) -> WatchedStep:
+    """A vector, then outcomes of the sensors (see `outcomes_of`); the updates count for doubts."""
+    last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
+    seen = [
+        jnp.stack([jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)])
+        for _, info in sorted(step.info.items())
+    ]
+    return WatchedStep.of(step, jnp.concatenate([vector, *seen, *last]))
+
+
+def outcomes_of(
+    rest: np.ndarray, sensors: Sequence[str], suspects: Sequence[str]
+) -> tuple[dict[str, MeasurementOutcome], dict[str, float]]:
+    """Outcome of each sensor, and probability that each suspect of a bank is at fault.
+
+    Args:
+        rest: what `watched` adds to its vector.
+        sensors: of the step, sorted.
+        suspects: of the filter; those without a probability are left out.
+    """
+    rows, last = np.split(rest, [3 * len(sensors)])
+    seen = {
+        name: MeasurementOutcome(Code(int(code)), nis, int(dof))
+        for name, (code, nis, dof) in zip(sensors, rows.reshape(-1, 3).tolist(), strict=True)
+    }
+    return seen, dict(zip(suspects, last.tolist(), strict=False))
+
+
+def outliers_of(seen: Mapping[str, MeasurementOutcome], wrong: Mapping[str, float]) -> list[str]:
+    """Sensors whose measurement a filter refused, or a bank took for faulty, in its last step."""
+    return [
+        name
+        for name, one in seen.items()
+        if one.code == Code.REFUSED or (one.dof > 0 and wrong.get(name, 0.0) > 0.5)
+    ]
 
 
 class TimestampGate:

@@ -33,8 +33,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from robins.errors import require
-from robins.filters import Belief, Code, Filter, FilterState, Model
-from robins.filters.kalman import WRONG
+from robins.filters import Belief, Filter, FilterState, Model
 from robins.filters.machine import usual
 from robins.filters.online import WatchedStep
 from robins.filters.run import Step
@@ -47,19 +46,23 @@ from robins.systems.ins_gnss.recording import axes_of
 from robins.systems.ins_gnss.rest import UsualIntervals
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.parts import ImuBlock
-from robins.systems.streaming import Flag, Live, LiveError, TimestampGate, numbers, online, stamp
+from robins.systems.streaming import (
+    Flag,
+    Live,
+    LiveError,
+    MeasurementOutcome,
+    TimestampGate,
+    numbers,
+    online,
+    outcomes_of,
+    outliers_of,
+    stamp,
+    watched,
+)
 from robins.systems.study import Case
 
 _PATIENCE_S = 0.1
 _WIDTH = 19  # of the vector: attitude, velocity, position and nine sigmas
-
-
-class MeasurementOutcome(NamedTuple):
-    """Outcome of a measurement in the filter."""
-
-    code: Code
-    nis: float  # normalised innovation squared
-    dof: int  # components that were measured
 
 
 class Navigation(NamedTuple):
@@ -92,12 +95,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 def kept(step: Step) -> WatchedStep:
     """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
-    last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
-    seen = [
-        jnp.stack([jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)])
-        for _, info in sorted(step.info.items())
-    ]
-    return WatchedStep.of(step, jnp.concatenate([_vector(step.posterior), *seen, *last]))
+    return watched(step, _vector(step.posterior))
 
 
 def answer_of(
@@ -117,22 +115,8 @@ def answer_of(
         suspects: of a bank.
     """
     lat, lon, alt = x[7:10].tolist()
-    rows, rest = np.split(x[_WIDTH:], [3 * len(sensors)])
-    seen = {
-        name: MeasurementOutcome(Code(int(code)), nis, int(dof))
-        for name, (code, nis, dof) in zip(sensors, rows.reshape(-1, 3).tolist(), strict=True)
-    }
-    wrong = dict(zip(suspects, rest.tolist(), strict=False))
+    seen, wrong = outcomes_of(x[_WIDTH:], sensors, suspects)
     return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:_WIDTH], flags, wrong, seen)
-
-
-def outliers_of(answer: Navigation) -> list[str]:
-    """Sensors whose measurement a filter refused, or a bank took for faulty, in its last step."""
-    return [
-        name
-        for name, one in answer.seen.items()
-        if one.code == Code.REFUSED or (one.dof > 0 and answer.wrong.get(name, 0.0) > 0.5)
-    ]
 
 
 class LiveInsGnss(Live):
@@ -236,7 +220,7 @@ class LiveInsGnss(Live):
         field = None if field_t is None else numbers("field", field_t, 3)
         why = self._door.check(time, values.ravel())
         if why == "anew":
-            later = any(time > self._path.time_ns[-1:])
+            later = any(time > self._path.imu.time_ns[-1:])
             self.counts["imu_gaps_declared" if later else "begun_anew"] += 1
             self._restart()
         elif why:
@@ -285,19 +269,19 @@ class LiveInsGnss(Live):
         if self._past:
             oldest_s, is_first = self._past[0][0], self._past[0][0] == self._begun_s
         if is_first:  # this fix may change the start itself
-            newest_s = self._path.seconds(int(self._path.time_ns[-1]))
+            newest_s = self._path.seconds(int(self._path.imu.time_ns[-1]))
             oldest_s = min(oldest_s, newest_s - self._delay_s)
         if why := self._path.refused(row, oldest_s):
             self.counts[f"gnss_{why}"] += 1
         if why and not (why == "nan" and self._online is not None):  # an empty fix is an epoch
-            return self._answer(int([time, *self._path.time_ns][-1]), Flag.REFUSED)
+            return self._answer(int([time, *self._path.imu.time_ns][-1]), Flag.REFUSED)
         self._path.push_fix(row)
         if is_first and row[0] <= self._begun_s:
             self._go_back_to(0)
         else:
             self._go_back(float(row[0]))
         self._advance()
-        return self._answer(int(self._path.time_ns[-1]), Flag.REFUSED if why else Flag(0))
+        return self._answer(int(self._path.imu.time_ns[-1]), Flag.REFUSED if why else Flag(0))
 
     def _advance(self) -> None:
         """Make all filter steps that the samples allow."""
@@ -331,11 +315,11 @@ class LiveInsGnss(Live):
         """Step the filter to an epoch, with the measurements there."""
         assert self._online is not None
         found = np.asarray(self._online.step(y, u, aux, keep=kept))
-        time_ns = round(epoch[0] * 1e9) + self._path.origin_ns
+        time_ns = round(epoch[0] * 1e9) + self._path.imu.origin_ns
         self._last_step = time_ns, found, sorted(y)
         self.epoch = self._epoch()
         self.passed.append(self.epoch)
-        counted = [f"outliers_{name}" for name in outliers_of(self.epoch)]
+        counted = [f"outliers_{name}" for name in outliers_of(self.epoch.seen, self.epoch.wrong)]
         counted += ["blocks_over_imu_gaps"] * int(np.asarray(u.noise_scale) > 1.0)
         self.counts.update(counted)
         self._past.append(epoch)
@@ -346,7 +330,9 @@ class LiveInsGnss(Live):
         """Answer of the last step of the filter."""
         time_ns, found, sensors = self._last_step
         answer = answer_of(time_ns, found, Flag(0), sensors, self._suspects)
-        return answer._replace(flags=Flag.OUTLIER if outliers_of(answer) else Flag(0))
+        return answer._replace(
+            flags=Flag.OUTLIER if outliers_of(answer.seen, answer.wrong) else Flag(0)
+        )
 
     def _forget(self) -> None:
         """Drop states and samples older than the longest delay."""

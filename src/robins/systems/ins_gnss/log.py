@@ -21,7 +21,7 @@ from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief
 from robins.filters.values import Numbers
-from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
+from robins.ins.blocks import epochs_between, gained_in_window, rate_about
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
@@ -153,29 +153,12 @@ def steps_of(
         usual: intervals of samples and fixes.
     """
     p, increments = parameters, log.increments
-    u = blocks_of(increments, log.time_s, begin_s, epochs, p, usual)
+    u = replaying.imu_blocks(increments, log.time_s, begin_s, epochs, p.update, usual.sample_s)
     rate = rate_about(increments, log.time_s, epochs, usual.sample_s)
     window_s = p.gnss.velocity_window
     y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
     known, about = measured_rest(log, epochs, rate, p.aids, usual)
     return u, y | known, aux | about, rate
-
-
-def blocks_of(
-    increments: Increments,
-    time_s: np.ndarray,
-    begin_s: float,
-    epochs: np.ndarray,
-    parameters: InsGnssReplay,
-    usual: UsualIntervals,
-    spare: int = 0,
-) -> ImuBlock:
-    """Blocks from epoch to epoch, as wide as the longest block, plus `spare` increments."""
-    p = parameters.update
-    width = usual_width(p.longest_block, usual.sample_s) + spare
-    blocks = cut(increments, time_s, begin_s, epochs, least=width)
-    scale = replaying.noise_scale(blocks, increments.dt, p.gap_noise, usual.sample_s)
-    return ImuBlock(blocks.increments, scale)
 
 
 def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Belief:
@@ -252,7 +235,7 @@ def measured_rest(
         near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
         received = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])
         y[model.ODOMETER] = np.where(received, np.interp(epochs, t, speed), np.nan)[:, None]
-        about[model.ODOMETER] = model.Wheel(np.interp(epochs, t, sigma)[:, None], rate)
+        about[model.ODOMETER] = model.Fix(np.interp(epochs, t, sigma)[:, None], rate)
     return y, about
 
 

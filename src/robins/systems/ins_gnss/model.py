@@ -73,17 +73,10 @@ def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
 
 
 class Fix(NamedTuple):
-    """Inputs of a GNSS position besides the state."""
+    """Inputs of a GNSS position, or of a wheel speed, besides the state."""
 
-    sigma: ArrayLike  # (3,) m, north east down
-    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
-
-
-class Wheel(NamedTuple):
-    """Inputs of a wheel speed besides the state."""
-
-    sigma: ArrayLike  # (1,) m/s
-    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the time
+    sigma: ArrayLike  # (3,) m, north east down; of a wheel (1,) m/s
+    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the time of the measurement
 
 
 class Velocity(NamedTuple):
@@ -142,7 +135,7 @@ def _read_velocity(mount: Mount, x: InsState, fix: Velocity):
     return antenna_velocity(x, mount, jnp.asarray(fix.omega_b)) - gained
 
 
-def _fix_sigma(x: InsState, fix: Fix | Velocity | Wheel):
+def _fix_sigma(x: InsState, fix: Fix | Velocity):
     return fix.sigma
 
 
@@ -162,7 +155,7 @@ def _read_road(mount: Mount, x: InsState, omega_b: Array):
     return _axle_velocity_b(mount, x, omega_b)[1:]
 
 
-def _read_wheel(mount: Mount, x: InsState, wheel: Wheel):
+def _read_wheel(mount: Mount, x: InsState, wheel: Fix):
     return _axle_velocity_b(mount, x, jnp.asarray(wheel.omega_b))[:1]
 
 
@@ -207,7 +200,7 @@ def ins_gnss_model(imu: InsGnssImu, gnss: Gnss, aids: Aids) -> Model:
         A model with sensors, in order: "gnss_position" (a `Geodetic`, aux `Fix`),
         "gnss_velocity" ((3,) NED, aux `Velocity`), "zero_velocity" ((3,), zeros), "zero_rate" ((3,)
         mean gyro rate at rest), "non_holonomic" ((2,) zeros; aux mean gyro rate) and "odometer"
-        ((1,), aux `Wheel`). A NaN
+        ((1,), aux `Fix`). A NaN
         measurement is missing; a run without a sensor's name omits that sensor.
     """
     noise, mount = noise_of(imu), mount_of(gnss, aids)

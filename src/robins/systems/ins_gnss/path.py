@@ -17,23 +17,23 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation as SciRotation
 
-from robins.dataset import GnssTable, ImuTable
+from robins.dataset import GnssTable
 from robins.filters import Belief
-from robins.ins.blocks import epochs_between, reach_of_rate
-from robins.ins.increments import Increments, from_imu
-from robins.systems.ins_gnss.log import InsGnssSteps, blocks_of, first_belief, steps_of
+from robins.ins.blocks import due_epochs, reach_of_rate
+from robins.ins.increments import Increments, IncrementStream
+from robins.systems.ins_gnss.log import InsGnssSteps, first_belief, steps_of
 from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.positions import attitudes
 from robins.systems.ins_gnss.recording import Log, believed_sigmas
 from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
 from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_start
 from robins.systems.parts import ImuBlock
+from robins.systems.replaying import imu_blocks
 from robins.systems.streaming import LiveError, numbers, refuse_units
 
 _AHEAD_S = 10.0  # most that a fix may be ahead of the newest sample
 _COURSE_S = 30.0  # wait for a course before a magnetometer is used
 _UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: to check their unit; kept for the start
-_CONTEXT = 3  # samples that an increment needs before its last
 # Row of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s],
 # its sigmas [m/s], quality; NaN where missing.
 WIDTH = 14
@@ -44,8 +44,7 @@ class InsGnssPath:
     """Converter of samples and fixes to steps of the filter (see the module).
 
     Attributes:
-        origin_ns: stamp of the first sample, zero of the clock of the path.
-        time_ns: (M,) stamps of the last samples; empty before the first.
+        imu: increments of the samples; the first sample is zero of the clock of the path.
         first_fix_s: s, time of the first complete fix.
         reach_s: s, lag of the steps behind the samples.
     """
@@ -59,11 +58,9 @@ class InsGnssPath:
             delay_s: s, largest delay of a fix; older parts of the log are dropped.
         """
         self._parameters = p = parameters
-        self.origin_ns, self.time_ns = 0, np.zeros(0, np.int64)
-        self._raw = np.zeros((0, 6))  # (M, 6) samples of these stamps
+        self.imu = IncrementStream(usual.sample_s)
         self._steps = np.zeros((0, 8))  # end [s], dt, theta, dv of each increment kept
         self._first = 0  # number of increments before these
-        self._newest = np.zeros((0, 8))  # the last increment, provisional
         self.fixes = np.zeros((0, WIDTH))  # rows of `row_of`, by time
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._known, self._velocities = tuple(usual), False
@@ -82,29 +79,12 @@ class InsGnssPath:
 
     def seconds(self, time_ns: int) -> float:
         """Time [s] of a stamp on the clock of the path; NaN before the first sample."""
-        return (time_ns - self.origin_ns) * 1e-9 if len(self.time_ns) else math.nan
+        imu = self.imu
+        return (time_ns - imu.origin_ns) * 1e-9 if len(imu.time_ns) else math.nan
 
     def push(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
-        """Add samples.
-
-        Args:
-            time_ns: (M,) int64, increasing.
-            rows: (M, 6) gyro [rad/s] and accel [m/s^2] in body axes.
-        """
-        if not len(self.time_ns):
-            self.origin_ns = int(time_ns[0])
-        final = self._first + len(self._steps)
-        self.time_ns = np.concatenate([self.time_ns[-_CONTEXT:], time_ns])
-        self._raw = np.concatenate([self._raw[-_CONTEXT:], rows])
-        if len(self._raw) < 2:
-            return
-        table = ImuTable(self.time_ns, self._raw[:, :3], self._raw[:, 3:], "rate")
-        made, end_ns = from_imu(table, self._usual.sample_s)
-        ends = (end_ns - self.origin_ns) * 1e-9
-        found = np.column_stack([ends, *(np.asarray(a, float) for a in made[:3])])
-        if len(self._raw) > _CONTEXT:  # else later samples change all increments
-            self._steps = np.concatenate([self._steps, found[1 if final else 0 : -1]])
-        self._newest = found[-1:]
+        """Add samples, as `IncrementStream.push`."""
+        self._steps = np.concatenate([self._steps, self.imu.push(time_ns, rows)])
 
     def push_field(self, time_ns: int, field_b: np.ndarray) -> None:
         """Add a magnetometer reading (3,) [T], in body axes, for the start."""
@@ -117,7 +97,7 @@ class InsGnssPath:
             row: of `row_of`.
             oldest_s: s, oldest epoch to which the filter can return.
         """
-        newest_s = self._newest[0, 0] if len(self._newest) else 0.0
+        newest_s = self.imu.newest[0, 0] if len(self.imu.newest) else 0.0
         if math.isnan(row[0]) or row[0] <= 0.0:
             return "too_old"  # before the first sample
         if np.any(np.abs(self.fixes[:, 0] - row[0]) < 1e-9):
@@ -194,7 +174,7 @@ class InsGnssPath:
         """Piece of a log with the increments kept, and the fixes up to a time."""
         rows, f, gnss = self._steps, self.fixes, self._parameters.gnss
         f = f[f[:, 0] <= until_s]
-        table = table_of(f, self.origin_ns, self._velocities)
+        table = table_of(f, self.imu.origin_ns, self._velocities)
         log = Log(
             Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
             rows[:, 0],
@@ -207,7 +187,7 @@ class InsGnssPath:
             first=self._first,
         )
         if gnss.use_velocity:  # present even without data, so that the first one compiles nothing
-            stated = table_of(f, self.origin_ns, velocities=True)
+            stated = table_of(f, self.imu.origin_ns, velocities=True)
             log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(stated, gnss)[1])
         if len(self._field):
             return log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
@@ -226,13 +206,7 @@ class InsGnssPath:
         longest_s, fixes_s = self._parameters.update.longest_block, self.fixes[:, 0]
         if known_s <= time_s:
             return []
-        # one block further, whose end is not an epoch
-        edges = epochs_between(wanted_s, known_s + longest_s, fixes_s, longest_s, even=False)
-        out = []
-        for edge_s in edges[(edges > time_s) & (edges <= known_s)].tolist():
-            wanted_s = edge_s if edge_s in fixes_s else wanted_s
-            out.append((edge_s, wanted_s))
-        return out
+        return due_epochs(known_s, time_s, wanted_s, fixes_s, longest_s)
 
     def steps(self, begin_s: float, epochs: np.ndarray) -> InsGnssSteps:
         """Steps from an epoch to later ones (E,) [s] from `due`."""
@@ -244,9 +218,14 @@ class InsGnssPath:
         """Block (1, K) from an epoch to the newest sample, whose last increment is provisional."""
         rows = self._steps[self._steps[:, 0] > begin_s - 2.0 * self._usual.sample_s]
         final_s = rows[-1, 0] if len(rows) else begin_s
-        rows = np.concatenate([rows, self._newest[self._newest[:, 0] > final_s]])
-        inc, epochs = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]), rows[-1:, 0]
-        return blocks_of(inc, rows[:, 0], begin_s, epochs, self._parameters, self._usual, 8)
+        newest = self.imu.newest
+        rows = np.concatenate([rows, newest[newest[:, 0] > final_s]])
+        inc, t, update = (
+            Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
+            rows[:, 0],
+            self._parameters.update,
+        )
+        return imu_blocks(inc, t, begin_s, t[-1:], update, self._usual.sample_s, 8)
 
     def forget(self, oldest_s: float) -> None:
         """Drop history that no step from an epoch on needs, in large pieces."""

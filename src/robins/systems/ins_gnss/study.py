@@ -87,7 +87,7 @@ def view(drive: Drive, course: InsGnssCourse) -> View:
     Raises:
         ValueError: `settle` is not before the end of the run.
     """
-    epoch_s, blocks = course.blocks.epoch_s, state_blocks(drive.imu.scale_states)
+    epoch_s, blocks = course.epoch_s, state_blocks(drive.imu.scale_states)
     refuse_unsettled("settle", drive.settle, float(epoch_s[-1]) + 1e-9)
     p = course.truth.position
     context = place_arrays("reference", (p.lat, p.lon, p.alt), "true {}")

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters.values import Numbers
-from robins.ins.blocks import Blocks, cut, epochs_between
+from robins.ins.blocks import cut, epochs_between
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise_chunked, nav_at
@@ -41,7 +41,9 @@ class InsGnssCourse(NamedTuple):
 
     motion: MotionProfile
     ideal: Increments  # (N,), (N, 3), (N, 3) samples of an ideal unit
-    blocks: Blocks  # of the same, with coning and sculling compensated
+    epoch_s: np.ndarray  # (E,)
+    blocks: Increments  # (E, K) of the same, with coning and sculling compensated
+    parent: np.ndarray  # (E, K) the increment of each piece, -1 where padded
     start: Nav
     truth: Nav  # at each epoch, leading axis E
     sample: np.ndarray  # (E,) index of the sample that ends at each epoch
@@ -104,7 +106,7 @@ def lay_out(drive: Drive) -> InsGnssCourse:
         raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
     # blocks after the last fix would not end on a sample, so the run ends with the fix
     epochs = epochs_between(0.0, float(stamps[-1]), stamps, drive.update.longest_block)
-    blocks = cut(compensated, time_s, 0.0, epochs)
+    blocks, parent = cut(compensated, time_s, 0.0, epochs)
     start = nav_at(trajectory, 0, np)
     path = mechanise_chunked(start, compensated)
     index = np.searchsorted(time_s, epochs - 1e-9)
@@ -121,7 +123,9 @@ def lay_out(drive: Drive) -> InsGnssCourse:
     return InsGnssCourse(
         motion=motion,
         ideal=Increments(dt, table.gyro[1:], table.accel[1:]),
+        epoch_s=epochs,
         blocks=blocks,
+        parent=parent,
         start=start,
         truth=jax.tree_util.tree_map(lambda x: x[index], path),
         sample=index,
@@ -144,10 +148,10 @@ def simulate(drive: Drive, course: InsGnssCourse, seed: int, index: Array) -> Ca
     key = partial(stream, seed, index)
     turned, pushed, errors = corrupt(dt, theta, dv, error_model(drive.imu), key(Component.IMU))
     # the share of each piece in its parent sample is the same for all runs
-    parent, padded = course.blocks.parent, course.blocks.parent < 0
-    share = course.blocks.increments.dt / np.asarray(course.ideal.dt)[parent]
+    parent, padded = course.parent, course.parent < 0
+    share = course.blocks.dt / np.asarray(course.ideal.dt)[parent]
     share = jnp.asarray(np.where(padded, 0.0, share))[..., None]
-    pieces = course.blocks.increments
+    pieces = course.blocks
     u = ImuBlock(
         Increments(
             jnp.asarray(pieces.dt),
