@@ -6,7 +6,8 @@ block or with a fix take a step of the filter. Nothing is compiled meanwhile. Fi
 an `OnlineFilter` of fifteen states takes; then the live objects, with their filters on each
 machine, and how long they took to be made.
 
-    python benchmarks/live.py [calls] [marg] [ekf] [robust] [ranges] [vm] [jax] [c]
+    python benchmarks/live.py [calls] [marg] [ekf] [robust] [ranges] [product] [adaptive]
+        [vm] [jax] [c]
 """
 
 import sys
@@ -27,6 +28,8 @@ from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, drive_dataset
 from robins.systems.ins_gnss import InsGnssReplay as Navigated
 from robins.systems.marg import LiveMarg, MargReplay
 from robins.systems.streaming import Flag
+from robins.systems.transfer_alignment import LiveAlignment, PairReplay
+from robins.systems.transfer_alignment.product.world import lay_out, simulate_pair
 
 SAMPLES = 6_000
 LATE_S = 0.1
@@ -160,9 +163,31 @@ def ranges(machine: str) -> None:
     told(f"LiveGnss, {machine}, an epoch", epochs, 1.0 / city.rate)
 
 
+def pair(name: str, machine: str) -> None:
+    """The aircraft: a slave at 50 Hz, records at 10 Hz."""
+    given = scenario.parse(
+        PairReplay, SYSTEMS["transfer-alignment"].scenarios["aircraft"].read_text()
+    )
+    run = simulate_pair(given, lay_out(given), 0, jnp.asarray(0))
+    live = made(LiveAlignment, given, given.slave.rate, filter=name, machine=machine)
+    master, p = run.master, run.master.position
+    parts = *run.increments[:3], p.lat, p.lon, p.alt, master.v_n, master.q_nb.wxyz
+    dt, theta, dv, lat, lon, alt, v, q = (np.asarray(a, float) for a in parts)
+    samples, records, step_s = [], [], 1.0 / given.slave.rate
+    for e in range(len(dt)):
+        for k in range(dt.shape[1]):
+            stamp = round(1e9 * step_s * (e * dt.shape[1] + k + 0.5))
+            rows = theta[e, k] / step_s, dv[e, k] / step_s
+            samples.append(timed(live.push_imu, stamp, *rows))
+        stamp = round(1e9 * step_s * (e + 1) * dt.shape[1])
+        records.append(timed(live.push_record, stamp, lat[e], lon[e], alt[e], v[e], q[e]))
+    told(f"LiveAlignment {name}, {machine}, a sample", samples, step_s)
+    told(f"LiveAlignment {name}, {machine}, a record", records, step_s)
+
+
 if __name__ == "__main__":
     asked = [a for a in sys.argv[1:] if a not in MACHINES]
-    asked = asked or ["calls", "marg", "ekf", "robust", "ranges"]
+    asked = asked or ["calls", "marg", "ekf", "robust", "ranges", "product", "adaptive"]
     if "calls" in asked:
         calls()
     for machine in [m for m in MACHINES if m in sys.argv[1:]] or MACHINES:
@@ -173,3 +198,6 @@ if __name__ == "__main__":
                 navigation(name, machine)
         if "ranges" in asked:
             ranges(machine)
+        for name in ("product", "adaptive"):
+            if name in asked:
+                pair(name, machine)

@@ -56,6 +56,7 @@ FRONT_DOOR = {
     "publish": "robins.workbench:publish",
     "load_result": "robins.results:read",
     # one sample at a time, and on a board
+    "LiveAlignment": "robins.systems.transfer_alignment:LiveAlignment",
     "LiveGnss": "robins.systems.gnss:LiveGnss",
     "LiveInsGnss": "robins.systems.ins_gnss:LiveInsGnss",
     "LiveMarg": "robins.systems.marg:LiveMarg",

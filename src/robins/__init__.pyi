@@ -24,6 +24,7 @@ from robins.systems.ins_gnss.live import LiveInsGnss as LiveInsGnss
 from robins.systems.marg.live import LiveMarg as LiveMarg
 from robins.systems.study import Scenario as Scenario
 from robins.systems.study import Study as Study
+from robins.systems.transfer_alignment.product.live import LiveAlignment as LiveAlignment
 from robins.workbench.doctor import examine as doctor
 from robins.workbench.export import export_filter as export_filter
 from robins.workbench.publication import publish as publish
@@ -32,6 +33,7 @@ from robins.workbench.run import run as run
 
 __all__ = [
     "Belief",
+    "LiveAlignment",
     "LiveGnss",
     "LiveInsGnss",
     "LiveMarg",

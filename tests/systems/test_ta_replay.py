@@ -130,7 +130,7 @@ def belief_of(piece):
 
 
 def only_piece(pair):
-    (piece,), problems = pieces_of(on_one_clock(pair), PAIR)
+    (piece,), problems = pieces_of(*on_one_clock(pair), PAIR)
     assert not problems
     return piece
 

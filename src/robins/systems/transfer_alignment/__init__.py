@@ -7,6 +7,8 @@
 
 from robins.systems.study import System
 from robins.systems.transfer_alignment import attitude_matching, product, velocity_attitude
+from robins.systems.transfer_alignment.product.live import LiveAlignment, SlaveAlignment
+from robins.systems.transfer_alignment.product.parameters import PairReplay
 
 SYSTEM = System(
     name="transfer-alignment",
@@ -20,4 +22,4 @@ SYSTEM = System(
     alignment=product.ALIGNMENT,
 )
 
-__all__ = ["SYSTEM"]
+__all__ = ["SYSTEM", "LiveAlignment", "PairReplay", "SlaveAlignment"]

@@ -8,24 +8,22 @@ gap in the slave's samples that is too long to bridge ends a piece; the next one
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from robins import linalg, units
-from robins.dataset import Dataset, Trajectory
-from robins.earth import earth_rate_n, transport_rate_n
+from robins.dataset import Dataset
 from robins.filters import Belief
 from robins.filters.values import Numbers
-from robins.ins.blocks import cut, epochs_between
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
-from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
+from robins.ins.increments import from_imu, usual_interval
+from robins.ins.mechanise import nav_at, refuse_polar, vector
 from robins.results import Outcome, Progress, ignore_progress, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
@@ -34,8 +32,9 @@ from robins.systems.replaying import FilterEstimates, LogPiece, ReportedItems
 from robins.systems.study import Case, Contender, PairAlignment, Recipe
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
-from robins.systems.transfer_alignment.product.model import Installation, ProductState
+from robins.systems.transfer_alignment.product.model import ProductState
 from robins.systems.transfer_alignment.product.parameters import PairParameters, PairReplay
+from robins.systems.transfer_alignment.product.path import PairPath
 from robins.systems.transfer_alignment.product.study import (
     BLOCKS,
     SENSORS,
@@ -51,26 +50,12 @@ _ATTITUDE, _MOUNTING, _FLEXURE = slice(0, 3), slice(15, 18), slice(18, 21)
 # -------------------------------------------------------------------------------- log to pieces
 
 
-class RecordedPair(NamedTuple):
-    """A recorded pair on one clock, whose zero is the slave's first sample; NED/FRD."""
+def on_one_clock(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """The tables of a pair that was examined and cleaned (`robins.logs`), in NED/FRD.
 
-    increments: Increments  # of the slave: (N,), (N, 3), (N, 3)
-    time_s: np.ndarray  # (N,) end of each
-    master: Trajectory
-    master_s: np.ndarray  # (M,)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairPiece(LogPiece):
-    """A stretch of a recorded pair without a long gap in the slave's samples."""
-
-    world: PairRun
-    record: np.ndarray  # (E,) row of the master's table used there, -1 where there is none
-    first: int  # row of the initial state
-
-
-def on_one_clock(dataset: Dataset) -> RecordedPair:
-    """The tables of a pair that was examined and cleaned (`robins.logs`).
+    Returns:
+        Increments of the slave (N, 8) and records of the master (M, 14), rows of `PairPath`; the
+        slave's first sample is zero of their clock.
 
     Raises:
         ValueError: there is no master, or it has no record within the slave's log.
@@ -88,107 +73,61 @@ def on_one_clock(dataset: Dataset) -> RecordedPair:
             f"{time_s[-1]:.1f} s, the master {master_s[0]:.1f} to {master_s[-1]:.1f} s; do both "
             "use the same time scale?"
         )
-    return RecordedPair(
-        Increments(*(np.asarray(a, float) for a in increments[:3])), time_s, master, master_s
-    )
+    rate = np.full_like(master.v_n, np.nan) if master.omega_ib_b is None else master.omega_ib_b
+    records = np.column_stack([master_s, vector(nav_at(master, slice(None))), rate])
+    return np.column_stack([time_s, *increments[:3]]), records
 
 
-def pieces_of(recorded: RecordedPair, parameters: PairReplay) -> tuple[list[PairPiece], list[str]]:
+def pieces_of(
+    increments: np.ndarray, records: np.ndarray, parameters: PairReplay
+) -> tuple[list[LogPiece], list[str]]:
     """Pieces prepared for filters, and a sentence for each stretch that cannot be used.
+
+    Args:
+        increments: (N, 8), and
+        records: (M, 14), see `on_one_clock`.
+        parameters: of the replay.
 
     Raises:
         ValueError: no stretch can be used; the message gives the reason.
     """
-    longest = parameters.recording.longest_gap
-    prepare = partial(_prepare, recorded, parameters)
-    return replaying.prepare_pieces(
-        recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare
-    )
+    time_s, dt = increments[:, 0], increments[:, 1]
+    path = partial(PairPath, parameters, usual_interval(dt))
+    prepare = partial(_prepare, path, increments, records, parameters.master.delay)
+    return replaying.prepare_pieces(time_s, dt, parameters.recording.longest_gap, prepare)
 
 
-def _prepare(recorded: RecordedPair, parameters: PairReplay, rows: slice) -> PairPiece:
-    increments = Increments(*(np.asarray(a)[rows] for a in recorded.increments[:3]))
-    time_s, master_s, delay = recorded.time_s[rows], recorded.master_s, parameters.master.delay
-    begin_s, end_s = float(time_s[0] - increments.dt[0]), float(time_s[-1])
-    reported = nav_at(recorded.master, slice(None))
-    whole = np.isfinite(np.asarray(vector(reported))).all(axis=1)
-    within = (master_s - delay >= begin_s - 1e-9) & (master_s <= end_s + 1e-9)
-    if not np.any(within & whole):
-        late = f" (records are {delay:g} s old)" if delay else ""
+def _prepare(
+    new_path: Callable[[], PairPath],
+    increments: np.ndarray,
+    records: np.ndarray,
+    delay_s: float,
+    rows: slice,
+) -> LogPiece:
+    path, end_s = new_path(), float(increments[rows][-1, 0])
+    path.push(increments[rows])
+    at_end = np.abs(records[:, 0] - end_s) <= 1e-9
+    path.push_records(np.column_stack([np.where(at_end, end_s, records[:, 0]), records[:, 1:]]))
+    path.end()
+    if (found := path.start()) is None:
+        late = f" (records are {delay_s:g} s old)" if delay_s else ""
         raise ValueError(
             "no record of the master with position, velocity and attitude, which the slave could "
             f"start from, while it was sampled{late}"
         )
-    k = int(np.flatnonzero(within & whole)[0])
-    start_s = float(np.clip(master_s[k] - delay, begin_s, end_s))
-    used = np.flatnonzero((master_s > master_s[k]) & (master_s <= end_s + 1e-9))
-    if len(used) == 0:
-        raise ValueError(f"the master has no record after the first whole one, {master_s[k]:.1f} s")
-    stamps, recording = np.minimum(master_s[used], end_s), parameters.recording
-    epochs = epochs_between(start_s, end_s, stamps, recording.longest_block)
-    blocks = cut(increments, time_s, start_s, epochs)
-    record = np.full(len(epochs), -1)
-    record[np.searchsorted(epochs, stamps - 1e-9)] = used
-
-    def at_epochs(values: Numbers, fill: float = np.nan) -> np.ndarray:
-        known = (record >= 0).reshape(-1, *([1] * (np.ndim(values) - 1)))
-        return np.where(known, np.asarray(values)[record], fill)
-
-    at = installation_of(parameters)
-    at_s = np.clip(master_s - delay, begin_s, end_s)
-    of_slave = _gyro_rate(increments, time_s, float(np.median(recorded.increments.dt)), at_s)
-    turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
-    if (omega := recorded.master.omega_ib_b) is not None:
-        turn = np.where(np.isfinite(omega), omega, turn)
-    scale = replaying.noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
-    world = PairRun(
-        increments=blocks.increments,
-        noise_scale=scale,
-        start=_slave_of(jax.tree.map(lambda x: x[k], reported), at, jnp.asarray(turn[k])),
-        initial_error=np.zeros(9),
-        master=jax.tree.map(at_epochs, reported),
-        master_omega_b=at_epochs(turn, 0.0),
-        truth=None,
-    )
-    return PairPiece(
+    begin_s, start = found
+    if not np.any(path.records[:, 0] <= end_s):
+        only_s = begin_s + delay_s
+        raise ValueError(f"the master has no record after the first whole one, {only_s:.1f} s")
+    epochs = np.array([edge_s for edge_s, _ in path.due(begin_s, begin_s)])
+    block, master, lag = path.steps(begin_s, epochs)
+    world = PairRun(*block, start, np.zeros(9), master, lag.omega_m, None, lag)
+    return LogPiece(
         world=jax.tree.map(jnp.asarray, world),
-        begin_s=start_s,
+        begin_s=begin_s,
         epoch_s=epochs,
-        noise_scale=scale,
-        record=record,
-        first=k,
+        noise_scale=np.asarray(block.noise_scale),
     )
-
-
-def _gyro_rate(
-    increments: Increments, time_s: np.ndarray, usual_dt: float, at_s: np.ndarray
-) -> np.ndarray:
-    """Mean of the gyros over 10 ms, or a sample, to either side of times (M,): (M, 3) rad/s.
-
-    Rotated by the nominal mounting it replaces the master's angular rate where that was not
-    recorded: with a lever arm of metres, biases and mounting error are negligible.
-    """
-    edge_s = np.concatenate([[time_s[0] - increments.dt[0]], time_s])
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(increments.theta, axis=0)])
-    # towards an end of the samples both sides become shorter, so that the mean stays centred
-    half = np.minimum(max(0.01, usual_dt), np.minimum(at_s - edge_s[0], edge_s[-1] - at_s))
-    half = np.maximum(half, 0.5 * usual_dt)
-
-    def until(t):
-        return np.stack([np.interp(t, edge_s, a) for a in angle.T], -1)
-
-    early, late = (np.clip(at_s + k * half, edge_s[0], edge_s[-1]) for k in (-1.0, 1.0))
-    return (until(late) - until(early)) / (late - early)[:, None]
-
-
-@jax.jit
-def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
-    """State of the slave from a master record: nominal mounting, lever arm, no flexure."""
-    q_nm, v_n, place = master
-    arm_n = q_nm.apply(at.lever_m)
-    omega_in = earth_rate_n(place.lat) + transport_rate_n(place.lat, place.alt, v_n)
-    swing = q_nm.apply(jnp.cross(omega_b, at.lever_m)) - jnp.cross(omega_in, arm_n)
-    return Nav(q_nm @ at.q_ms, v_n + swing, place.retract(arm_n))
 
 
 def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
@@ -293,11 +232,11 @@ def remarks(name: str, answer: FilterEstimates) -> list[str]:
     return remarks_found
 
 
-def _started(piece: PairPiece, recorded: RecordedPair, delay_s: float) -> str:
+def _started(piece: LogPiece, delay_s: float) -> str:
     old = f", which was {delay_s:g} s old" if delay_s else ""
     return (
         f"Aligned from {piece.begin_s:.2f} to {piece.epoch_s[-1]:.2f} s, starting from the "
-        f"master's record of {recorded.master_s[piece.first]:.2f} s{old}."
+        f"master's record of {piece.begin_s + delay_s:.2f} s{old}."
     )
 
 
@@ -312,23 +251,22 @@ def replay(
     Raises:
         ValueError: no such filter; or the pair cannot be aligned, the message gives the reason.
     """
-    recorded = on_one_clock(dataset)
-    pieces, problems = pieces_of(recorded, parameters)
+    increments, records = on_one_clock(dataset)
+    pieces, problems = pieces_of(increments, records, parameters)
     wanted = tuple(filters) or parameters.filters
     answers = replaying.run_filters(
         pieces, wanted, partial(contender, parameters), progress=progress
     )
-    master = recorded.master
-    notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
+    notes = [_started(piece, parameters.master.delay) for piece in pieces]
     notes += [f"Not aligned, {problem}." for problem in problems]
-    if master.omega_ib_b is None and any(parameters.lever_arm):
+    if not np.any(np.isfinite(records[:, 11:])) and any(parameters.lever_arm):
         notes.append("The master's turn rate was not recorded; the slave's gyros stand in for it.")
     notes += [line for name, answer in answers.items() for line in remarks(name, answer)]
-    time, path = "master_time", (master.lat_rad, master.lon_rad, master.alt_m)
-    variables = {time: variable(time, recorded.master_s, "s", "time of the master's records")}
+    time, path = "master_time", tuple(records[:, 8:11].T)
+    variables = {time: variable(time, records[:, 0], "s", "time of the master's records")}
     variables |= tracks({name: answer.mean for name, answer in answers.items()})
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
-    used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
+    used = sum(int(np.sum(np.isin(records[:, 0], piece.epoch_s))) for piece in pieces)
     return replaying.outcome(
         replaying.epochs_of(pieces),
         answers,
@@ -337,7 +275,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts)
         | replaying.gap_counts(pieces, problems)
-        | {"master_records_not_used": len(master) - used - len(pieces)},
+        | {"master_records_not_used": len(records) - used - len(pieces)},
         notes=notes,
         origin_ns=int(dataset.imu.time_ns[0]),
     )

@@ -75,7 +75,7 @@ def installation_of(pair: PairParameters) -> pm.Installation:
     return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
-def _matched(believed: PairAssumptions) -> list[str]:
+def matched_records(believed: PairAssumptions) -> list[str]:
     """Names of the records of the master that a filter takes."""
     return [name for name in pm.RECORDS if name != pm.POSITION or believed.position]
 
@@ -87,7 +87,7 @@ def model_of(pair: PairParameters, believed: PairAssumptions, flexure: Flexure |
         ValueError: a noise of the master is zero, so that its records cannot be weighted.
     """
     sigmas = {}
-    for name in _matched(believed):
+    for name in matched_records(believed):
         key = pm.RECORDS[name].sigma
         sigmas[name] = np.asarray(getattr(pair.master, key))
         if not np.all(sigmas[name] > 0.0):
@@ -126,7 +126,9 @@ def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) ->
     if len(sigma) == _RIGID:
         flexure, truth = None, truth and truth._replace(flexure=None)
     mean = pm.ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
-    lag = pm.lag_of(run.increments, delay_s, run.master_omega_b)
+    lag = run.lag
+    if lag is None:
+        lag = pm.lag_of(run.increments, delay_s, run.master_omega_b)
     return Case(
         start=Belief(mean, jnp.diag(sigma)),
         u=ImuBlock(run.increments, run.noise_scale),
@@ -268,7 +270,7 @@ def _view(given: Product, course: PairCourse) -> View:
     return View(
         epoch_s=course.epoch_s,
         blocks=tuple(_REPORTED.values()),
-        sensors={name: SENSORS[name] for name in _matched(given.believed)},
+        sensors={name: SENSORS[name] for name in matched_records(given.believed)},
         metrics=product_metrics,
         context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),
         shown=tracks,

@@ -44,7 +44,12 @@ from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import MotionProfile, at_lever_arm
 from robins.systems.parts import any_there, as_array, outside, signed
 from robins.systems.parts import motion_of as driven
-from robins.systems.transfer_alignment.product.model import RECORDS, MasterQuantity, ProductState
+from robins.systems.transfer_alignment.product.model import (
+    RECORDS,
+    MasterQuantity,
+    ProductState,
+    RecordDelay,
+)
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
     GroundVehicle,
@@ -213,6 +218,7 @@ class PairRun(NamedTuple):
     master: Nav  # leading axis E, as reported; NaN where missing
     master_omega_b: Any  # (E, 3) rad/s, omega_ib_b of the master at the time of its record
     truth: ProductState | None  # of the slave, leading axis E; None where it is not known
+    lag: RecordDelay | None = None  # of the records; None: that of the delay a filter assumes
 
 
 def simulate_pair(pair: PairParameters, course: PairCourse, seed: int, index: Array) -> PairRun:
