@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation as Scipy
 
 from robins import rotation as rot
 from robins.rotation import Rotation
+from robins.rotation.arithmetic import SMALL
 
 EPS = np.finfo(float).eps
 SIZES = {
@@ -111,7 +112,7 @@ def test_series_and_closed_form_are_both_exact_at_their_switch():
     given = q.astype(np.longdouble)
     exact = 2 * np.arctan2(given[:, 1], given[:, 0])
     np.testing.assert_array_less(np.abs(np.asarray(log(q))[:, 0] - exact), 2.5 * EPS * exact)
-    small = np.sum(q[:, 1:] ** 2, -1) < rot._SMALL
+    small = np.sum(q[:, 1:] ** 2, -1) < SMALL
     assert 0 < np.count_nonzero(small) < len(q)  # both branches were seen
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from robins.earth import wgs84
+from robins.earth import Geodetic, wgs84
 
 # One unit in the last place of an Earth-fixed coordinate is 0.93e-9 m. Sines, products and a
 # square root cost a few of these: so the error is below 1e-9 m root mean square, and its worst case
@@ -104,7 +104,7 @@ def test_a_place_deep_in_the_earth_has_no_geodetic_coordinates(r_e):
     with pytest.raises(ValueError, match="m from the centre of the Earth"):
         wgs84.geodetic_from_ecef(r_e)
     with pytest.raises(ValueError, match="give metres, 5"):
-        wgs84.Geodetic.from_ecef(jnp.asarray(r_e))
+        Geodetic.from_ecef(jnp.asarray(r_e))
 
 
 def test_gradient_of_geodetic_coordinates_is_the_inverse_of_the_other():
@@ -254,6 +254,6 @@ def test_everything_broadcasts_over_leading_axes():
     assert wgs84.gravity(lat, 0).shape == (2, 3)
     assert wgs84.gravity_n(0.3, lat).shape == (2, 3, 3)
     assert wgs84.earth_rate_n(lat).shape == (2, 3, 3)
-    one_speed = wgs84.transport_rate_n(lat, 0.0, np.array([10.0, 20.0, 0.0]))
+    one_speed = wgs84.transport_rate_n(lat, np.zeros(()), np.array([10.0, 20.0, 0.0]))
     many = wgs84.transport_rate_n(lat, np.zeros((2, 3)), np.full((2, 3, 3), [10.0, 20.0, 0.0]))
     np.testing.assert_array_equal(one_speed, many)

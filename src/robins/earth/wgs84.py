@@ -2,30 +2,20 @@
 
 Latitude is geodetic [rad], longitude [rad] east, height [m] above the ellipsoid. The local frame n
 is north, east, down; e is Earth-centred, Earth-fixed. All functions broadcast over leading axes and
-take Python, NumPy or JAX numbers.
+take Python, NumPy or JAX numbers; given NumPy arrays only they compute by NumPy, with nothing to
+compile, else by JAX.
 
 The constants are those of NIMA TR8350.2 (3rd ed., 2000): four defining ones, the rest derived here
 to full precision.
-
-`Geodetic` is a position over the ellipsoid as an element of a state.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from robins import _float64  # noqa: F401
 from robins.errors import require
-from robins.manifold import wrap
-from robins.rotation import Real
+from robins.linalg.library import ArrayLike, Each, Real, is_traced, library
 
 A_M = 6378137.0  # semi-major axis
 F = 1.0 / 298.257223563  # flattening
@@ -67,42 +57,44 @@ _LOWEST = -1e6  # m, height; the confocal ellipsoids of gravity degenerate near 
 _POLAR = 1e-9  # cosine of a latitude 6 mm from a pole
 
 
-def _floats(*values: ArrayLike) -> list[Array]:
-    return [jnp.asarray(v, float) for v in values]
+def _floats(*values: ArrayLike) -> list[Real]:
+    """Library of the given numbers, and they as its arrays."""
+    xp = library(*values)
+    return [xp, *(xp.asarray(v, float) for v in values)]
 
 
 def _refuse_deep(alt_m: ArrayLike) -> None:
-    if not isinstance(alt_m, Tracer):
+    if not is_traced(alt_m):
         lowest = np.min(np.asarray(alt_m, float), initial=np.inf)
         require(not lowest < _LOWEST, f"a height must be {_LOWEST:g} m or more, got {lowest:.6g}")
 
 
-def curvature_radii(lat_rad: ArrayLike) -> tuple[Array, Array]:
+def curvature_radii(lat_rad: ArrayLike) -> tuple[Each, Each]:
     """Radii of curvature [m] of the ellipsoid: in the meridian and in the prime vertical.
 
     A step d north, e east at height h changes latitude by ``d / (meridian + h)`` and longitude by
     ``e / ((transverse + h) cos(lat))`` (Groves 2013, eq. 2.105 and 2.106).
     """
-    (lat,) = _floats(lat_rad)
-    w_sq = 1.0 - E2 * jnp.sin(lat) ** 2
-    transverse = A_M / jnp.sqrt(w_sq)
+    xp, lat = _floats(lat_rad)
+    w_sq = 1.0 - E2 * xp.sin(lat) ** 2
+    transverse = A_M / xp.sqrt(w_sq)
     return transverse * (1.0 - E2) / w_sq, transverse
 
 
 def ecef_from_geodetic(
     lat_rad: ArrayLike, lon_rad: ArrayLike, alt_m: ArrayLike
-) -> Float[Array, "*b 3"]:
+) -> Float[Real, "*b 3"]:
     """Earth-fixed position r_e [m] of geodetic coordinates."""
-    lat, lon, alt = _floats(lat_rad, lon_rad, alt_m)
-    sin_lat = jnp.sin(lat)
-    transverse = A_M / jnp.sqrt(1.0 - E2 * sin_lat**2)
-    across = (transverse + alt) * jnp.cos(lat)
+    xp, lat, lon, alt = _floats(lat_rad, lon_rad, alt_m)
+    sin_lat = xp.sin(lat)
+    transverse = A_M / xp.sqrt(1.0 - E2 * sin_lat**2)
+    across = (transverse + alt) * xp.cos(lat)
     up = ((1.0 - E2) * transverse + alt) * sin_lat
-    x, y, z = jnp.broadcast_arrays(across * jnp.cos(lon), across * jnp.sin(lon), up)
-    return jnp.stack([x, y, z], -1)
+    x, y, z = xp.broadcast_arrays(across * xp.cos(lon), across * xp.sin(lon), up)
+    return xp.stack([x, y, z], -1)
 
 
-def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
+def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Each, Each, Each]:
     """Latitude [rad], longitude [rad] in [-pi, pi] and height [m] of an Earth-fixed position [m].
 
     Bowring (1976): the parametric latitude is improved a fixed two times, each of which squares the
@@ -114,8 +106,8 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
         ValueError: a position is deeper than that (the Earth's centre, or kilometres given for
             metres) or infinite; not in compiled code, where the centre gives NaN.
     """
-    (r,) = _floats(r_e)
-    if not isinstance(r, Tracer):
+    xp, r = _floats(r_e)
+    if not is_traced(r):
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(np.asarray(r), axis=-1)
         farthest = np.max(distance, initial=0.0)
@@ -128,30 +120,31 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
             f"give metres, {_DEEPEST:g} m or more from it",
         )
     x, y, z = r[..., 0], r[..., 1], r[..., 2]
-    p = jnp.sqrt(x * x + y * y)
-    sin_lat, cos_lat = _unit(z, (1.0 - E2) * p)
+    p = xp.sqrt(x * x + y * y)
+    sin_lat, cos_lat = _unit(xp, z, (1.0 - E2) * p)
     for _ in range(2):
-        sin_beta, cos_beta = _unit((1.0 - F) * sin_lat, cos_lat)
-        sin_lat, cos_lat = _unit(z + _EP2 * B_M * sin_beta**3, p - E2 * A_M * cos_beta**3)
-    alt = p * cos_lat + z * sin_lat - A_M * jnp.sqrt(1.0 - E2 * sin_lat**2)
-    return jnp.arctan2(sin_lat, cos_lat), jnp.arctan2(y, x), alt
+        sin_beta, cos_beta = _unit(xp, (1.0 - F) * sin_lat, cos_lat)
+        sin_lat, cos_lat = _unit(xp, z + _EP2 * B_M * sin_beta**3, p - E2 * A_M * cos_beta**3)
+    alt = p * cos_lat + z * sin_lat - A_M * xp.sqrt(1.0 - E2 * sin_lat**2)
+    return xp.arctan2(sin_lat, cos_lat), xp.arctan2(y, x), alt
 
 
-def _unit(s, c):
-    length = jnp.sqrt(s * s + c * c)
+def _unit(xp, s, c):
+    length = xp.sqrt(s * s + c * c)
     return s / length, c / length
 
 
-def dcm_en(lat_rad: ArrayLike, lon_rad: ArrayLike) -> Float[Array, "*b 3 3"]:
+def dcm_en(lat_rad: ArrayLike, lon_rad: ArrayLike) -> Float[Real, "*b 3 3"]:
     """C_en: maps north-east-down components to Earth-fixed ones, ``v_e = C_en @ v_n``."""
-    lat, lon = jnp.broadcast_arrays(*_floats(lat_rad, lon_rad))
-    sp, cp, sl, cl = jnp.sin(lat), jnp.cos(lat), jnp.sin(lon), jnp.cos(lon)
+    xp, *given = _floats(lat_rad, lon_rad)
+    lat, lon = xp.broadcast_arrays(*given)
+    sp, cp, sl, cl = xp.sin(lat), xp.cos(lat), xp.sin(lon), xp.cos(lon)
     rows = (
         (-sp * cl, -sl, -cp * cl),
         (-sp * sl, cl, -cp * sl),
-        (cp, jnp.zeros_like(cp), -sp),
+        (cp, xp.zeros_like(cp), -sp),
     )
-    return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
+    return xp.stack([xp.stack(r, -1) for r in rows], -2)
 
 
 def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
@@ -160,16 +153,15 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     The closed form in ellipsoidal coordinates (Heiskanen & Moritz 1967, section 2-7 and 2-8; NIMA
     TR8350.2, eq. 4-5 to 4-20), exact at every height; on the ellipsoid it is Somigliana's formula.
     Above the ellipsoid the plumb line is curved: the north component is -8.1e-9 sin(2 lat) per
-    metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Given NumPy arrays it returns one, and
-    nothing is compiled. The mechanisation evaluates `robins.ins.zonal_gravity`: change both.
+    metre of height, 8e-5 m/s^2 at 10 km and 45 deg. The mechanisation evaluates
+    `robins.ins.zonal_gravity`: change both.
 
     Raises:
         ValueError: a height is below -1000 km; not in compiled code.
     """
     _refuse_deep(alt_m)
-    given = (lat_rad, alt_m)
-    xp = np if all(isinstance(x, np.ndarray) for x in given) else jnp
-    lat, alt = xp.broadcast_arrays(*(xp.asarray(x, float) for x in given))
+    xp, *given = _floats(lat_rad, alt_m)
+    lat, alt = xp.broadcast_arrays(*given)
     sin_lat, cos_lat = xp.sin(lat), xp.cos(lat)
     transverse = A_M / xp.sqrt(1.0 - E2 * sin_lat**2)
     p = (transverse + alt) * cos_lat
@@ -204,22 +196,22 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     return xp.stack([north, xp.zeros_like(north), down], -1)
 
 
-def gravity(lat_rad: ArrayLike, alt_m: ArrayLike) -> Array:
+def gravity(lat_rad: ArrayLike, alt_m: ArrayLike) -> Each:
     """Magnitude of normal gravity [m/s^2], exact at every height; see `gravity_n`."""
     g = gravity_n(lat_rad, alt_m)
-    return jnp.sqrt(g[..., 0] ** 2 + g[..., 2] ** 2)
+    return library(g).sqrt(g[..., 0] ** 2 + g[..., 2] ** 2)
 
 
-def earth_rate_n(lat_rad: ArrayLike) -> Float[Array, "*b 3"]:
+def earth_rate_n(lat_rad: ArrayLike) -> Float[Real, "*b 3"]:
     """Rotation of the Earth omega_ie_n [rad/s], north-east-down."""
-    (lat,) = _floats(lat_rad)
-    return jnp.stack(
-        [OMEGA_E * jnp.cos(lat), jnp.zeros_like(lat), -OMEGA_E * jnp.sin(lat)],
+    xp, lat = _floats(lat_rad)
+    return xp.stack(
+        [OMEGA_E * xp.cos(lat), xp.zeros_like(lat), -OMEGA_E * xp.sin(lat)],
         -1,
     )
 
 
-def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Float[Array, "*b 3"]:
+def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Float[Real, "*b 3"]:
     """Rotation of the local frame over the Earth omega_en_n [rad/s] at velocity v_n [m/s].
 
     North-east-down; Groves (2013), eq. 5.44.
@@ -228,10 +220,10 @@ def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Fl
         ValueError: a latitude is that of a pole, where north is not defined; a height is below
             -1000 km; v_n does not have three components (the only check in compiled code).
     """
-    lat, alt, v = _floats(lat_rad, alt_m, v_n)
+    xp, lat, alt, v = _floats(lat_rad, alt_m, v_n)
     require(v.shape[-1:] == (3,), "v_n has 3 components along its last axis", v.shape)
     _refuse_deep(alt)
-    if not isinstance(lat, Tracer):
+    if not is_traced(lat):
         require(
             not np.any(np.abs(np.cos(np.asarray(lat))) < _POLAR),
             "the local frame has no rate at a pole, where north is not defined; use ECEF",
@@ -239,79 +231,5 @@ def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Fl
     meridian, transverse = curvature_radii(lat)
     north = v[..., 1] / (transverse + alt)
     east = -v[..., 0] / (meridian + alt)
-    north, east, down = jnp.broadcast_arrays(north, east, -north * jnp.tan(lat))
-    return jnp.stack([north, east, down], -1)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Geodetic:
-    """Geodetic latitude and longitude [rad] and height above the ellipsoid [m]: one or many.
-
-    Tangent vectors are metres north, east, down, taken with the curvature radii at the point the
-    step begins. `local` is the exact inverse of `retract`, also across the 180 deg meridian; the
-    longitude stays in [-pi, pi). Neither is defined at the poles, where there is no east.
-    """
-
-    lat: Any  # (...) array, rad
-    lon: Any  # (...) array, rad
-    alt: Any  # (...) array, m
-
-    dim = 3
-    units: ClassVar[dict[str, str]] = {
-        "lat": "rad, geodetic latitude, positive north",
-        "lon": "rad, longitude, positive east",
-        "alt": "m, height above the ellipsoid, positive up",
-    }
-
-    @classmethod
-    def from_degrees(cls, lat_deg, lon_deg, alt_m) -> Geodetic:
-        """Make from latitude and longitude [deg] and height [m]; not for use under `jit`.
-
-        Raises:
-            ValueError: a latitude is beyond 90 deg, or a number is not finite.
-        """
-        lat, lon, alt = (np.asarray(v, float) for v in (lat_deg, lon_deg, alt_m))
-        for name, value in (("lat_deg", lat), ("lon_deg", lon), ("alt_m", alt)):
-            if not np.all(np.isfinite(value)):
-                raise ValueError(f"{name} = {value}: every value must be finite")
-        if np.any(np.abs(lat) > 90.0):
-            raise ValueError(
-                f"lat_deg = {lat}: a latitude lies in [-90, 90] deg; "
-                "are latitude and longitude exchanged?"
-            )
-        lat, lon, alt = np.broadcast_arrays(np.deg2rad(lat), np.deg2rad(lon), alt)
-        return cls(jnp.asarray(lat), wrap(jnp.asarray(lon)), jnp.asarray(alt))
-
-    @classmethod
-    def from_ecef(cls, r_e) -> Geodetic:
-        """Make from an Earth-fixed position [m]."""
-        lat, lon, alt = geodetic_from_ecef(jnp.asarray(r_e, float))
-        return cls(lat, wrap(lon), alt)
-
-    def as_ecef(self) -> Float[Array, "*b 3"]:
-        """Earth-fixed position r_e [m]."""
-        return ecef_from_geodetic(self.lat, self.lon, self.alt)
-
-    def _metres_per_radian(self):
-        meridian, transverse = curvature_radii(self.lat)
-        return meridian + self.alt, (transverse + self.alt) * jnp.cos(self.lat)
-
-    def retract(self, delta: Float[Array, "*b 3"]) -> Geodetic:
-        """Move by metres north, east, down."""
-        north, east = self._metres_per_radian()
-        return Geodetic(
-            self.lat + delta[..., 0] / north,
-            wrap(self.lon + delta[..., 1] / east),
-            self.alt - delta[..., 2],
-        )
-
-    def local(self, other: Geodetic) -> Float[Array, "*b 3"]:
-        """Metres north, east, down for which ``self.retract(metres) == other``."""
-        north, east = self._metres_per_radian()
-        n, e, d = jnp.broadcast_arrays(
-            (other.lat - self.lat) * north,
-            wrap(other.lon - self.lon) * east,
-            self.alt - other.alt,
-        )
-        return jnp.stack([n, e, d], -1)
+    north, east, down = xp.broadcast_arrays(north, east, -north * xp.tan(lat))
+    return xp.stack([north, east, down], -1)

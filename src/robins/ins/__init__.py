@@ -13,29 +13,34 @@
 - `alignment`: attitude at rest, from gravity, Earth rate or velocity; `rest`: detection of rest.
 """
 
-from robins.ins.alignment import (
-    Alignment,
-    StaticCheck,
-    align,
-    gyrocompass,
-    heading_from_velocity,
-    is_static,
-    level,
-)
-from robins.ins.extended_pose import ExtendedPose
-from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
-from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
-from robins.ins.increments import Increments, from_imu
-from robins.ins.invariant import (
-    InvariantState,
-    direction_sensor,
-    invariant_motion,
-    landmark_sensor,
-    position_sensor,
-    velocity_sensor,
-)
-from robins.ins.mechanise import Nav, as_trajectory, nav_at, refuse_polar
-from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
+from typing import TYPE_CHECKING
+
+from robins.errors import lazy
+
+if TYPE_CHECKING:
+    from robins.ins.alignment import (
+        Alignment,
+        StaticCheck,
+        align,
+        gyrocompass,
+        heading_from_velocity,
+        is_static,
+        level,
+    )
+    from robins.ins.extended_pose import ExtendedPose
+    from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
+    from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
+    from robins.ins.increments import Increments, from_imu
+    from robins.ins.invariant import (
+        InvariantState,
+        direction_sensor,
+        invariant_motion,
+        landmark_sensor,
+        position_sensor,
+        velocity_sensor,
+    )
+    from robins.ins.mechanise import Nav, as_trajectory, nav_at, refuse_polar
+    from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 __all__ = [
     "Alignment",
@@ -70,3 +75,20 @@ __all__ = [
     "to_ned_frd",
     "velocity_sensor",
 ]
+
+_FILES = {
+    "alignment": "Alignment StaticCheck align gyrocompass heading_from_velocity is_static level",
+    "extended_pose": "ExtendedPose",
+    "frames": "swap swap_q to_enu_rfu to_ned_frd",
+    "imu_errors": "ImuErrorModel TriadErrors grade",
+    "increments": "Increments from_imu",
+    "invariant": "InvariantState direction_sensor invariant_motion landmark_sensor position_sensor "
+    "velocity_sensor",
+    "mechanise": "Nav as_trajectory nav_at refuse_polar",
+    "state": "InsNoise InsState propagate propagate_linear",
+}
+
+__getattr__ = lazy(
+    __name__,
+    {name: f"{__name__}.{file}" for file, names in _FILES.items() for name in names.split()},
+)

@@ -16,9 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from robins.dataset import (
     AttitudeTable,
@@ -29,6 +27,7 @@ from robins.dataset import (
     NavFrame,
     Trajectory,
 )
+from robins.linalg.library import Each
 from robins.rotation import multiply, to_euler
 
 Table = TypeVar("Table", ImuTable, GnssTable, Trajectory, MagTable, AttitudeTable)
@@ -112,10 +111,10 @@ def _turned(q, turn_nav: bool, turn_body: bool):
     return q
 
 
-def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:
+def euler_enu_rfu(q_nb) -> tuple[Each, Each, Each]:
     """Roll, pitch, heading [rad] of an ENU/RFU attitude (..., 4).
 
     Positive right wing down, nose up, clockwise from north: the angles of
     `robins.rotation.to_euler` for the same vehicle in NED/FRD.
     """
-    return to_euler(swap_q(jnp.asarray(q_nb)))
+    return to_euler(swap_q(q_nb))

@@ -31,16 +31,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
 from robins.errors import require, require_kind
 from robins.ins.frames import to_ned_frd
-from robins.rotation import from_rotvec, multiply, normalise, rotate, to_rotvec
+from robins.linalg.library import Real
+from robins.rotation import multiply, normalise, rotate, to_rotvec
 
 _EVEN = 2.0  # largest ratio of neighbouring intervals for a cubic
 _OTHERS = [[j for j in range(4) if j != i] for i in range(4)]  # of four samples but one
@@ -308,9 +305,14 @@ def joined(increments: Increments) -> Increments:
     Args:
         increments: K of them, leading axis, with dr or without.
     """
+    import jax  # here: nothing else in this module needs it
+    import jax.numpy as jnp
+
+    from robins.rotation import from_rotvec
+
     inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in increments))
 
-    def add(sum_: tuple[Array, Array, Array, Array], one: Increments):
+    def add(sum_: tuple[Real, Real, Real, Real], one: Increments):
         q, dv, dr, dt = sum_
         dr = dr + dv * one.dt + rotate(q, one.dr)
         dv = dv + rotate(q, one.dv)

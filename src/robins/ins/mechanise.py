@@ -29,8 +29,9 @@ from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, displacement
 from robins.ins.kernel import one_kernel, pack
 from robins.ins.zonal_gravity import gravity_nd, horner
+from robins.linalg.library import Real
 from robins.linalg.scalars import cross, product, rotate
-from robins.rotation import Real, Rotation
+from robins.rotation import Rotation
 
 POLAR_LAT_RAD = math.radians(89.9)
 

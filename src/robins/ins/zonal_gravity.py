@@ -19,7 +19,7 @@ from numpy.polynomial.polynomial import polyder
 from robins import _float64  # noqa: F401
 from robins.earth import A_M, E2, GM, OMEGA_E
 from robins.earth.wgs84 import B_M, F
-from robins.rotation import Real
+from robins.linalg.library import Real
 
 Scalar = Float[Real, "..."]
 

@@ -5,29 +5,31 @@ algebra from this room and never call ``jnp.linalg`` themselves, so that its dif
 factors, gradients, signs) are solved in one place.
 """
 
-from robins.errors import moved
-from robins.linalg.dense import (
-    as_factor,
-    block_diagonal,
-    block_factor,
-    cholesky,
-    downdate,
-    eigenvalue_bounds,
-    factor,
-    guard,
-    independent_rows,
-    log_diagonal,
-    lost_in_rounding,
-    plainly_independent,
-    solve_lower,
-    solve_lower_transposed,
-    solve_spd,
-    symmetric_root,
-    tria,
-    van_loan,
-)
+from typing import TYPE_CHECKING
 
-__getattr__ = moved(__name__)
+from robins.errors import lazy
+
+if TYPE_CHECKING:
+    from robins.linalg.dense import (
+        as_factor,
+        block_diagonal,
+        block_factor,
+        cholesky,
+        downdate,
+        eigenvalue_bounds,
+        factor,
+        guard,
+        independent_rows,
+        log_diagonal,
+        lost_in_rounding,
+        plainly_independent,
+        solve_lower,
+        solve_lower_transposed,
+        solve_spd,
+        symmetric_root,
+        tria,
+        van_loan,
+    )
 
 __all__ = [
     "as_factor",
@@ -49,3 +51,5 @@ __all__ = [
     "tria",
     "van_loan",
 ]
+
+__getattr__ = lazy(__name__, dict.fromkeys(__all__, f"{__name__}.dense"))

@@ -9,27 +9,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array
+from jaxtyping import Shaped
 
-from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
+from robins.linalg.library import ArrayLike, Real
 
 if TYPE_CHECKING:  # stubs lack operators between a scalar of NumPy and an array of JAX
     Scalar = Any
 else:
-    Scalar = Array | np.ndarray | np.generic | float | int
+    Scalar = ArrayLike
 Three = Sequence[Scalar]
 Matrix = Sequence[Three]
 
 
-def scalars(v: Array) -> tuple[Scalar, ...]:
+def scalars(v: Shaped[Real, "n"]) -> tuple[Scalar, ...]:
     """Components of a vector."""
     return tuple(v[i] for i in range(v.shape[0]))
 
 
-def matrix(m: Array) -> Matrix:
+def matrix(m: Shaped[Real, "n m"]) -> Matrix:
     """Rows of a matrix, each a tuple of its components."""
     return tuple(scalars(m[i]) for i in range(m.shape[0]))
 
@@ -39,7 +36,9 @@ def settled(*vectors: Three) -> list[tuple[Scalar, ...]]:
 
     Otherwise XLA would recompute a component wherever it is used.
     """
-    return [scalars(v) for v in jax.lax.optimization_barrier([jnp.stack(v) for v in vectors])]
+    import jax
+
+    return [scalars(v) for v in jax.lax.optimization_barrier([jax.numpy.stack(v) for v in vectors])]
 
 
 def plus(a: Three, b: Three, *more: Three) -> Three:

@@ -52,7 +52,7 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> FixTrack | None:
     if v is not None:
         v = v[rows] if gnss.nav == "NED" else v[rows][:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     lat, lon, alt = place[rows].T
-    meridian, transverse = (np.asarray(r) for r in curvature_radii(lat))
+    meridian, transverse = curvature_radii(lat)
     east = np.unwrap(lon) - lon[0]
     r_n = np.stack(
         [(lat - lat[0]) * (meridian + alt), east * (transverse + alt) * np.cos(lat), alt[0] - alt],

@@ -10,7 +10,6 @@ import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -56,15 +55,15 @@ class Origin(NamedTuple):
 
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
         """C_el and the Earth-fixed position of the origin."""
-        lat, lon = np.deg2rad(self.lat_deg), np.deg2rad(self.lon_deg)
-        r_e = np.asarray(ecef_from_geodetic(lat, lon, self.alt_m))
-        return np.asarray(dcm_en(lat, lon)) @ SWAP, r_e
+        at = np.deg2rad(self.lat_deg), np.deg2rad(self.lon_deg), self.alt_m
+        lat, lon, alt = map(np.asarray, at)
+        return dcm_en(lat, lon) @ SWAP, ecef_from_geodetic(lat, lon, alt)
 
 
 def to_local(trajectory: Trajectory, origin: Origin) -> LocalPath:
     """Trajectory in the axes of the origin, with the curvature of the Earth."""
     C_el, r0_e = origin._axes()
-    r_e = np.asarray(ecef_from_geodetic(trajectory.lat_rad, trajectory.lon_rad, trajectory.alt_m))
+    r_e = ecef_from_geodetic(trajectory.lat_rad, trajectory.lon_rad, trajectory.alt_m)
     C_ln = C_el.T @ _axes_at(trajectory.lat_rad, trajectory.lon_rad, trajectory.nav)
     return LocalPath(
         trajectory.time_ns,
@@ -80,7 +79,7 @@ def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
     with np.errstate(invalid="ignore"):  # infinite coordinates become NaN, for `clean` to count
         r_e = r0_e + path.r_l @ C_el.T
     try:
-        lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
+        lat, lon, alt = geodetic_from_ecef(r_e)
     except ValueError as error:
         raise LogError(source or "path", str(error), "look at the unit of the path") from error
     C_nl = np.swapaxes(_axes_at(lat, lon, "ENU"), -1, -2) @ C_el
@@ -92,14 +91,13 @@ def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
 
 def _axes_at(lat_rad: np.ndarray, lon_rad: np.ndarray, nav: str) -> np.ndarray:
     """C_en (n, 3, 3) of the navigation axes at each place."""
-    C_en = np.asarray(dcm_en(lat_rad, lon_rad))
+    C_en = dcm_en(lat_rad, lon_rad)
     return C_en @ SWAP if nav == "ENU" else C_en
 
 
 def _compose(C: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Quaternions of the product of matrices C and the rotations of q."""
-    turned = rotation.multiply(rotation.from_dcm(jnp.asarray(C)), jnp.asarray(q, float))
-    return np.asarray(turned)
+    return rotation.multiply(rotation.from_dcm(C), np.asarray(q, float))
 
 
 OnBoard = TypeVar("OnBoard", bound=ImuTable | MagTable | AttitudeTable)
@@ -126,7 +124,7 @@ class Mounting:
         Raises:
             ValueError: an angle is not finite.
         """
-        C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*self._angles()))).T
+        C_bs = rotation.to_dcm(rotation.from_euler(*self._angles())).T
         # Rotations by right angles only permute axes, so rounding of 1e-16 must not mix them.
         whole = np.round(C_bs)
         return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
@@ -149,7 +147,7 @@ class Mounting:
             if not any((self.roll_deg, self.pitch_deg, self.yaw_deg)):
                 return dataclasses.replace(table, body="FRD")
             q_sb = rotation.from_euler(*self._angles())
-            q_nb = np.asarray(rotation.multiply(jnp.asarray(table.q_nb), q_sb))
+            q_nb = rotation.multiply(table.q_nb, q_sb)
             return dataclasses.replace(table, q_nb=q_nb, body="FRD")
         C_bs = self.dcm_bs()
         if isinstance(table, MagTable):

@@ -16,7 +16,6 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -68,7 +67,7 @@ def read_kitti(path: AnyPath, findings: Findings = None) -> Trajectory:
     time_ns = stamps_to_ns(str(times), "time", clock.texts[:, 0], clock.rows)
     matrix = poses.values.reshape(-1, 3, 4)
     try:
-        q_lb = np.asarray(rotation.from_dcm(jnp.asarray(_TO_ENU @ matrix[:, :, :3] @ _CAMERA)))
+        q_lb = rotation.from_dcm(_TO_ENU @ matrix[:, :, :3] @ _CAMERA)
     except ValueError as error:
         raise LogError(str(path), f"holds no rotation: {error}", "copy it again") from error
     r_l = matrix[:, :, 3] @ _TO_ENU.T
@@ -110,7 +109,7 @@ def read_sbet(path: AnyPath, findings: Findings = None) -> Trajectory:
         raise refused(file, where, "time")("is no time of the week", "fetch it again")
     with np.errstate(invalid="ignore"):
         euler = v[:, 7], v[:, 8], v[:, 9] - v[:, 10]
-        q_nb = np.asarray(rotation.from_euler(*euler))
+        q_nb = rotation.from_euler(*euler)
     time_ns = unrolled(np.round(v[:, 0] * 1e9).astype(np.int64))
     missing = np.full((count, 3), np.nan)
     lat, lon, alt = (v[:, k].astype(np.float64) for k in (1, 2, 3))
@@ -161,7 +160,7 @@ def read_inspva(path: AnyPath, findings: Findings = None) -> Trajectory:
     time_ns = week_to_ns(weeks, stamps_to_ns(file, "second", clock[:, 1], at))
     if (np.abs(weeks) > 7000).any() or (time_ns % WEEK_NS < 0).any():
         raise LogError(file, "has a week that is none of GPS", "record it again")
-    q_nb = np.asarray(rotation.from_euler(*np.deg2rad(v[:, 6:9]).T))
+    q_nb = rotation.from_euler(*np.deg2rad(v[:, 6:9]).T)
     lat, lon = np.deg2rad(v[:, :2]).T.copy()
     v_n = v[:, 3:6] * [1.0, 1.0, -1.0]
     return Trajectory(time_ns, lat, lon, v[:, 2].copy(), v_n, q_nb, source=file, rows=at)

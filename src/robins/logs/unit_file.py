@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -122,7 +121,7 @@ def _orientation(
     turned = np.rad2deg(np.arccos(np.clip((np.trace(C_bs @ whole.T) - 1.0) / 2.0, -1.0, 1.0)))
     right = abs(np.linalg.det(whole) - 1.0) < 1e-9 and turned < _RIGHT_DEG
     C_bs = whole if right else C_bs
-    angles = rotation.to_euler(rotation.from_dcm(jnp.asarray(C_bs.T)))
+    angles = rotation.to_euler(rotation.from_dcm(C_bs.T))
     roll, pitch, yaw = (float(np.round(np.rad2deg(float(a)), 1)) + 0.0 for a in angles)
     return (roll, pitch, yaw), float(turned) if right else None, C_bs
 

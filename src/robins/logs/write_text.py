@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Iterator
 from decimal import Decimal
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -161,11 +160,10 @@ def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> Group
 
 def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> Groups:
     """Attitudes as angles, or quaternions if the format has them and angles would lose digits."""
-    q = jnp.asarray(q_nb)
     if "roll" not in format.quantities:
         return {"quaternion": q_nb}
     # roll, pitch and heading are the same in both pairs of frames
-    roll, pitch, heading = map(np.asarray, rotation.to_euler(q))
+    roll, pitch, heading = rotation.to_euler(q_nb)
     angles = np.stack([roll, pitch, np.mod(heading, 2.0 * np.pi)], axis=-1)
     steep = np.nanmax(np.abs(angles[:, 1]), initial=0.0) > _STEEP
     if "q_w" in format.quantities and (nav == "ENU" or steep):

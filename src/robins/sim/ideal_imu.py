@@ -20,7 +20,8 @@ from robins.errors import require
 from robins.ins.frames import swap
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, step, step_each
-from robins.rotation import Real, conjugate, multiply, rotate, to_rotvec
+from robins.linalg.library import Real
+from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim.trajectory import MotionProfile
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)

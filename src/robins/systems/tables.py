@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike
 
-from robins.earth.wgs84 import Geodetic
+from robins.earth import Geodetic
 from robins.filters import Code
 from robins.filters.run import Step
 from robins.results import Variables, array, variable
