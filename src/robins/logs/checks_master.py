@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from robins.dataset import GnssTable, ImuTable, Trajectory
 from robins.ins.frames import to_ned_frd
@@ -31,6 +30,7 @@ from robins.logs.pair_motion import (
 )
 from robins.logs.quiet import error, finding, name_of, note, usual_step_s
 from robins.logs.tables import place_of
+from robins.rotation import conjugate, from_euler, to_euler
 
 _LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; less is noise of the attitudes
 _WELL, _BETTER = 0.3, 0.1  # unexplained shares of the rotation
@@ -40,10 +40,10 @@ _THIRD = 1.0 / 3.0  # likewise for velocities, whose fit has more parameters
 _CLEAR = 1.6  # times the scatter: steps of five such sigmas are significant among thousands
 _LATE_S, _TOO_LATE_S = 0.01, 0.02
 _SIGMAS = 5.0
-_CONVENTIONS = {
-    "heading": ((-1, 1, 1), "counted counterclockwise: count it clockwise from north"),
+_CONVENTIONS = {  # signs of roll, pitch, heading; what to do
+    "heading": ((1, 1, -1), "counted counterclockwise: count it clockwise from north"),
     "pitch": ((1, -1, 1), "positive with the nose down: turn its sign"),
-    "roll": ((1, 1, -1), "positive with the right wing up: turn its sign"),
+    "roll": ((-1, 1, 1), "positive with the right wing up: turn its sign"),
 }
 
 
@@ -143,16 +143,16 @@ def _other_attitudes(
     imu: ImuTable, master: Trajectory, shared: SharedMotion, as_is: TurningFit
 ) -> Finding | None:
     """Finding of another convention of the attitudes, if one explains the rotation."""
-    angles = shared.q.as_euler("ZYX")
+    angles = to_euler(shared.q)
     tried = {
         f"with {name} reversed": (
-            Rotation.from_euler("ZYX", angles * signs),
+            from_euler(*(s * a for s, a in zip(signs, angles, strict=True))),
             f"{name.capitalize()} is probably {remedy}",
         )
         for name, (signs, remedy) in _CONVENTIONS.items()
     }
     tried["the other way round"] = (
-        shared.q.inv(),
+        conjugate(shared.q),
         "They probably turn navigation to body axes: give their conjugates",
     )
     fits = {words: fit_turning(q, shared) for words, (q, _) in tried.items()}

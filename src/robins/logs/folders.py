@@ -20,7 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
@@ -36,6 +35,7 @@ from robins.logs.tables import Table
 from robins.logs.text import Columns, TextLayout, peek, read_columns
 from robins.logs.text_formats import TEXT_FORMATS
 from robins.logs.timebase import dates_to_ns, stamps_to_ns
+from robins.rotation import from_euler
 from robins.units import to_si
 
 _XYZ = ("x", "y", "z")
@@ -163,8 +163,8 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
 
 def _turning(roll: np.ndarray, pitch: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """Quaternions (n, 4), scalar first, body to navigation, of Euler angles [rad]."""
-    turns = Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=-1))
-    return turns.as_quat(canonical=True, scalar_first=True)
+    q = from_euler(roll, pitch, heading)
+    return np.where(q[:, :1] < 0.0, -q, q)
 
 
 def _record(path: Path) -> np.ndarray:

@@ -11,14 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable, Trajectory
 from robins.ins.plausible import G
 from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
 from robins.logs.quiet import signal_of
-from robins.rotation import skew
+from robins.rotation import conjugate, multiply, normalise, skew, to_dcm, to_rotvec
 
 _WINDOW_S = 0.5  # longest window, in which the body hardly turns
 _LONGEST_S = 2.0
@@ -31,7 +30,7 @@ class SharedMotion(NamedTuple):
 
     time_s: np.ndarray  # (w + 1,) of the records, since the first sample
     inside: np.ndarray  # (w,) bool, short windows within the time of the samples
-    q: Rotation  # (w + 1,) attitudes, body to navigation
+    q: np.ndarray  # (w + 1, 4) attitudes q_nb
     v_n: np.ndarray  # (w + 1, 3) m/s, NaN where missing
     sample_s: np.ndarray  # (n,)
     angle: np.ndarray  # (n, 3) rad, integral of the gyros
@@ -57,7 +56,7 @@ def shared_motion(imu: ImuTable, master: Trajectory) -> SharedMotion | None:
     inside &= np.diff(time_s) < _LONGEST_S
     if np.count_nonzero(inside) < 10:
         return None
-    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
+    q = normalise(master.q_nb[known])
     angle, pushed = (integral(signal.time_s, a, imu.kind) for a in (signal.gyro, signal.accel))
     return SharedMotion(time_s, inside, q, master.v_n[known], signal.time_s, angle, pushed)
 
@@ -67,9 +66,9 @@ def turned_by_gyros(shared: SharedMotion, lag_s: float = 0.0) -> np.ndarray:
     return np.diff(at(shared.time_s - lag_s, shared.sample_s, shared.angle), axis=0)[shared.inside]
 
 
-def turned(q: Rotation, shared: SharedMotion) -> np.ndarray:
-    """Rotation (k, 3) [rad] of attitudes at the records in each window."""
-    return (q[:-1].inv() * q[1:]).as_rotvec()[shared.inside]
+def turned(q: np.ndarray, shared: SharedMotion) -> np.ndarray:
+    """Rotation (k, 3) [rad] of attitudes (w + 1, 4) at the records in each window."""
+    return to_rotvec(multiply(conjugate(q[:-1]), q[1:]))[shared.inside]
 
 
 class TurningFit(NamedTuple):
@@ -81,12 +80,12 @@ class TurningFit(NamedTuple):
 
 
 def fit_turning(
-    q: Rotation, shared: SharedMotion, gyro_map: np.ndarray | None = None
+    q: np.ndarray, shared: SharedMotion, gyro_map: np.ndarray | None = None
 ) -> TurningFit:
     """Fit bias, mounting error and delay by Gauss-Newton, from the best of coarse delays.
 
     Args:
-        q: attitudes at the records, in the convention to test.
+        q: (w + 1, 4) attitudes at the records, in the convention to test.
         shared: the motion.
         gyro_map: (3, 3) applied to the gyros.
     """
@@ -126,10 +125,12 @@ def _pushes(v_n: np.ndarray, shared: SharedMotion) -> tuple[np.ndarray, ...] | N
     at_ = np.flatnonzero(shared.inside & np.isfinite(gained).all(axis=1))
     if len(at_) < 10:
         return None
-    q = shared.q[:-1] * Rotation.from_rotvec(0.5 * (shared.q[:-1].inv() * shared.q[1:]).as_rotvec())
+    before, after = shared.q[:-1], shared.q[1:]
+    far = np.sum(before * after, axis=-1, keepdims=True) < 0.0
+    middle = normalise(before + np.where(far, -after, after))
     pushed = np.diff(at(shared.time_s, shared.sample_s, shared.pushed), axis=0)
     length_s = np.diff(shared.time_s)
-    return at_, length_s[at_], q.as_matrix()[at_], gained[at_], pushed[at_]
+    return at_, length_s[at_], to_dcm(middle)[at_], gained[at_], pushed[at_]
 
 
 def forces_of(shared: SharedMotion) -> tuple[np.ndarray, np.ndarray] | None:
@@ -159,7 +160,7 @@ def fit_velocity(v_n: np.ndarray, shared: SharedMotion) -> np.ndarray | None:
     along = length_s[:, None, None]
     missing = gained - np.einsum("kij,kj->ki", C, pushed) - along[:, 0] * [0, 0, G]
     early, late = (at(shared.time_s + k * _HALF_S, shared.sample_s, shared.angle) for k in (-1, 1))
-    swing = np.diff(shared.q.as_matrix() @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[at_]
+    swing = np.diff(to_dcm(shared.q) @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[at_]
     design = np.concatenate([C * along, np.eye(3) * along, C @ skew(pushed), swing], axis=-1)
     left, _, _ = _least_squares(missing.ravel(), design.reshape(-1, 12))
     return np.sum(left.reshape(-1, 3) ** 2, axis=0)
