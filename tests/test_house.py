@@ -380,10 +380,10 @@ def test_importing_a_numeric_room_turns_64_bit_on():
 
 def test_a_user_who_turns_64_bit_off_is_told():
     code = (
-        "from robins import _float64; import jax; _float64.require();"
+        "from robins import _float64, logs; import jax; _float64.require();"  # logs import no JAX
         "print('wide'); jax.config.update('jax_enable_x64', False); _float64.require()"
     )
-    done = python(code)
+    done = python(code, JAX_ENABLE_X64="0")
     assert done.stdout == "wide\n"
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith(

@@ -192,3 +192,8 @@ def lazy(package: str, places: Mapping[str, str]) -> Callable:
         return found
 
     return attribute
+
+
+def places(package: str, files: Mapping[str, str]) -> dict[str, str]:
+    """Places for `lazy`, of the names that each file of a package defines, with blanks between."""
+    return {name: f"{package}.{file}" for file, names in files.items() for name in names.split()}

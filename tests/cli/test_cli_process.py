@@ -46,6 +46,38 @@ def test_what_computes_nothing_is_there_in_a_blink(argument):
     assert loaded.strip() == "[]"
 
 
+def test_questions_about_a_log_import_nothing_heavy(tmp_path):
+    """Writing, reading, turning and cleaning it, the doctor, and the guess of its columns."""
+    code = """
+    import atexit
+    import numpy as np
+    from robins import dataset, logs
+    t = np.arange(3001) / 50.0  # a circle of 25 m, at a rate that changes
+    a, w, o, k = 0.2 * t + np.cos(0.3 * t), 0.2 - 0.3 * np.sin(0.3 * t), 0.0 * t, slice(0, None, 10)
+    ns = np.round(t * 1e9).astype(np.int64)
+    noise = 0.01 * np.random.default_rng(1).normal(size=(6, t.size))
+    force = -2.25 * np.cos(0.3 * t), 25.0 * w**2, o - 9.81
+    gyro, accel = np.stack([o, o, w] + noise[:3], -1), np.stack(force + noise[3:], -1)
+    place = 0.8 + 25.0 * np.sin(a) / 6.37e6, 0.1 - 25.0 * np.cos(a) / 4.45e6, o + 430.0
+    v_n = 25.0 * np.stack([w * np.cos(a), w * np.sin(a), o], -1)
+    q_nb = np.stack([np.cos(a / 2), o, o, np.sin(a / 2)], -1)
+    path = dataset.Trajectory(ns, *place, v_n, q_nb)
+    fixes = dataset.GnssTable(ns[k], *(p[k] for p in place), 0.1 + 0.0 * v_n[k], v_n[k])
+    logs.write_log("imu.csv", dataset.ImuTable(ns, gyro, accel, "rate", "FRD"))
+    logs.write_log("gnss.csv", fixes, "kfgins-gnss")
+    logs.write_log("path.txt", path, "tum")
+    turned = logs.load_dataset(["imu.csv", "gnss.csv"], mounting=logs.Mounting(0.0, 5.0, 90.0))
+    logs.clean(turned)
+    told = lambda: print(sorted({"jax", "scipy", "xarray", "matplotlib"} & set(sys.modules)))
+    atexit.register(told)
+    main(["guess", "imu.csv"])
+    """
+    process = start(code, "doctor", "imu.csv", "gnss.csv", "path.txt", "--json", cwd=tmp_path)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == ExitStatus.DONE, out + err
+    assert out.splitlines()[-1] == "[]"
+
+
 # What is printed under a progress bar goes to the bar's terminal, so it is written below Python.
 SLOW = """
 import os

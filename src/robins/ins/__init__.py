@@ -15,7 +15,7 @@
 
 from typing import TYPE_CHECKING
 
-from robins.errors import lazy
+from robins.errors import lazy, places
 
 if TYPE_CHECKING:
     from robins.ins.alignment import (
@@ -88,7 +88,4 @@ _FILES = {
     "state": "InsNoise InsState propagate propagate_linear",
 }
 
-__getattr__ = lazy(
-    __name__,
-    {name: f"{__name__}.{file}" for file, names in _FILES.items() for name in names.split()},
-)
+__getattr__ = lazy(__name__, places(__name__, _FILES))

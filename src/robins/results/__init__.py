@@ -42,18 +42,22 @@ solution is the stamp at its zero: GPS time since 1970-01-01 (UTC and leap secon
 1980, the log's own clock. `to_dataframe` makes a table of the arrays on one clock, `Result` too.
 """
 
-from robins.errors import moved
-from robins.results.dataframe import clocks, to_dataframe
-from robins.results.errors import ResultError
-from robins.results.manifest import SCHEMA_VERSION, versions
-from robins.results.outcome import Outcome, Progress, ignore_progress
-from robins.results.probability import Probability
-from robins.results.reader import Result, read
-from robins.results.rescue import NotWritten, keep_on_error, rescued
-from robins.results.roles import ROLES, find
-from robins.results.solution import Variables, array, variable
-from robins.results.summary import VERDICTS, plain
-from robins.results.writer import ResultWriter
+from typing import TYPE_CHECKING
+
+from robins.errors import lazy, places
+
+if TYPE_CHECKING:
+    from robins.results.dataframe import clocks, to_dataframe
+    from robins.results.errors import ResultError
+    from robins.results.manifest import SCHEMA_VERSION, versions
+    from robins.results.outcome import Outcome, Progress, ignore_progress
+    from robins.results.probability import Probability
+    from robins.results.reader import Result, read
+    from robins.results.rescue import NotWritten, keep_on_error, rescued
+    from robins.results.roles import ROLES, find
+    from robins.results.solution import Variables, array, variable
+    from robins.results.summary import VERDICTS, plain
+    from robins.results.writer import ResultWriter
 
 __all__ = [
     "ROLES",
@@ -80,4 +84,18 @@ __all__ = [
     "versions",
 ]
 
-__getattr__ = moved(__name__)
+_FILES = {
+    "dataframe": "clocks to_dataframe",
+    "errors": "ResultError",
+    "manifest": "SCHEMA_VERSION versions",
+    "outcome": "Outcome Progress ignore_progress",
+    "probability": "Probability",
+    "reader": "Result read",
+    "rescue": "NotWritten keep_on_error rescued",
+    "roles": "ROLES find",
+    "solution": "Variables array variable",
+    "summary": "VERDICTS plain",
+    "writer": "ResultWriter",
+}
+
+__getattr__ = lazy(__name__, places(__name__, _FILES))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from robins.errors import lazy
+from robins.errors import lazy, places
 
 if TYPE_CHECKING:
     from robins.rotation.arithmetic import (
@@ -55,9 +55,10 @@ __all__ = [
     "turn_coefficients",
 ]
 
-_OF_ELEMENTS = {"BodyRotation", "Rotation", "from_rotvec", "left_jacobian", "turn_coefficients"}
+_FILES = {
+    "arithmetic": "conjugate from_dcm from_euler multiply normalise rotate skew to_dcm to_euler "
+    "to_rotvec",
+    "element": "BodyRotation Rotation from_rotvec left_jacobian turn_coefficients",
+}
 
-__getattr__ = lazy(
-    __name__,
-    {n: f"{__name__}.{'element' if n in _OF_ELEMENTS else 'arithmetic'}" for n in __all__},
-)
+__getattr__ = lazy(__name__, places(__name__, _FILES))

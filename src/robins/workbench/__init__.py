@@ -21,7 +21,7 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from robins.errors import lazy
+from robins.errors import lazy, places
 
 if TYPE_CHECKING:  # the functions that are named as their file, for editors
     from robins.workbench.allan import allan as allan
@@ -59,12 +59,12 @@ _FILES = {
     "tune": "tune",
     "workers": "campaign_run work_here",
 }
-_WHERE = {name: file for file, names in _FILES.items() for name in names.split()}
+_WHERE = places(__name__, _FILES)
 
 __all__ = sorted(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-__getattr__ = lazy(__name__, {name: f"{__name__}.{file}" for name, file in _WHERE.items()})
+__getattr__ = lazy(__name__, _WHERE)
 
 
 class _Functions(ModuleType):
