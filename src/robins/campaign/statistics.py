@@ -21,6 +21,7 @@ from robins.campaign.histogram import histogram_of, merged_histograms, percentil
 from robins.filters import Tally
 from robins.filters.analysis.consistency import Verdict, grand_mean_nis
 from robins.filters.chi_square import chi2_band
+from robins.filters.consistency_limits import LEVEL
 from robins.systems.study import Limit, Norm, StateBlock, View
 from robins.systems.suspects import HELD, edges
 
@@ -384,11 +385,11 @@ class Statistics:
         """(E,) average NEES over n."""
         return self.sums["nees"] / (self.runs * self.n)
 
-    def anees_band(self, level: float = 0.95) -> np.ndarray:
+    def anees_band(self, level: float = LEVEL) -> np.ndarray:
         """(2,) chi-square band of `anees` at this level."""
         return chi2_band(self.n, self.runs, level) / self.n
 
-    def anees_share_inside(self, level: float = 0.95) -> float:
+    def anees_share_inside(self, level: float = LEVEL) -> float:
         """Share of the epochs counted whose ANEES is inside its band."""
         low, high = self.anees_band(level)
         value = self.anees()[self.counted]
@@ -396,7 +397,7 @@ class Statistics:
             return float("nan")
         return float(np.mean((value >= low) & (value <= high)))
 
-    def nis(self, sensor: str, level: float = 0.95) -> Verdict:
+    def nis(self, sensor: str, level: float = LEVEL) -> Verdict:
         """Grand mean NIS of a sensor per degree of freedom, all runs and epochs, and its band."""
         return grand_mean_nis(self._all(f"nis of {sensor}"), self._all(f"dof of {sensor}"), level)
 

@@ -11,31 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.filters.belief import FAILURES, SENTENCES, Code, StepInfo
-from robins.filters.chi_square import chi2_band
+from robins.filters.consistency_limits import (
+    FEWEST,
+    NIS_HIGH,
+    NIS_LOW,
+    REFUSED_SHARE,
+    TEST_LEVEL,
+    correlated_band,
+)
 from robins.filters.values import Numbers
 from robins.filters.whiteness import innovation_sums, suspicions
 from robins.manifold import State
 
-REFUSED_SHARE = 1.0 / 3.0  # share of refused measurements above which they are reported
 APART_SHARE = 0.1  # share of measurements with diverging local filters above which it is reported
-FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is tested
-
-# Mean NIS per degree of freedom above or below which it is reported: standard deviations are half
-# or four times what they should be. Robust filters are cautious by design, so that side is wider.
-NIS_HIGH, NIS_LOW = 4.0, 1.0 / 16.0
-CORRELATED = 10  # degrees of freedom that count as one, since innovations may be correlated
-LEVEL = 0.999  # of the two-sided band of the mean NIS
-
-
-def correlated_band(dof: int, level: float = 0.95) -> np.ndarray:
-    """Band (2,) of the mean NIS of recorded data, in which `CORRELATED` innovations count as one.
-
-    Args:
-        dof: degrees of freedom of all innovations.
-        level: probability of the two-sided band.
-    """
-    count = max(dof // CORRELATED, 1)
-    return chi2_band(count, 1, level) / count
 
 
 class StepWarning(UserWarning):
@@ -162,7 +150,7 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
 
 def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     """Sentence on a mean NIS per degree of freedom that is far from one."""
-    low, high = correlated_band(dof, LEVEL)
+    low, high = correlated_band(dof, TEST_LEVEL)
     if (cautious or min(low, NIS_LOW) <= ratio) and ratio <= max(high, NIS_HIGH):
         return []
     why = (

@@ -20,12 +20,12 @@ from jaxtyping import ArrayLike
 from scipy.special import bdtrik, ndtr, ndtri
 
 from robins.filters.chi_square import chi_square
+from robins.filters.consistency_limits import FEWEST
 from robins.manifold import State
 
 FALSE_ALARM = 1e-5  # probability of a finding on a consistent run, over all sensors and tests
 BY_CHANCE = 1e-3  # probability that as many runs have a finding by chance
 TESTS = 5  # per component: correlation, sign overall, sign late, NIS late, share beyond CLIPPED
-FEWEST = 20  # innovations below which nothing is tested
 BEFORE = 10  # preceding innovations whose sum each innovation is correlated with
 CLIPPED = 3.0  # limit at which an innovation is clipped [sigma]
 FOLLOWING = 0.2  # least correlation with preceding innovations that is reported

@@ -13,6 +13,7 @@ from scipy.special import ndtri, stdtrit
 
 from robins import units
 from robins.errors import require, require_known
+from robins.filters.consistency_limits import TEST_LEVEL
 from robins.results import Probability
 
 Metric = float | int | str | list | Probability | None
@@ -270,7 +271,7 @@ def consistency(statistics: Any) -> dict[str, Metric]:
         "anees_share_inside": statistics.anees_share_inside(),
     } | statistics.mean_nees()
     for sensor in statistics.sensors:
-        verdict = statistics.nis(sensor, 0.999)
+        verdict = statistics.nis(sensor, TEST_LEVEL)
         out[f"nis_{sensor}"] = verdict.value
         out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
     return out

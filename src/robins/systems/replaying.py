@@ -23,9 +23,9 @@ from jaxtyping import Array, PyTree
 from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
+from robins.filters.consistency_limits import correlated_band
 from robins.filters.kalman import WRONG
 from robins.filters.run import Keep, Solution, Step, everything
-from robins.filters.tally import correlated_band
 from robins.filters.whiteness import joined
 from robins.ins.blocks import cut, usual_width
 from robins.ins.increments import Increments, after_gap

@@ -19,6 +19,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.chi_square import chi2_band, chi_square
+from robins.filters.consistency_limits import LEVEL
 from robins.manifold import State
 
 
@@ -53,7 +54,7 @@ def _require_level(level: float) -> None:
     require(0.0 < level < 1.0, "level must be a share between 0 and 1", level)
 
 
-def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Verdict:
+def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = LEVEL) -> Verdict:
     """Mean NIS per degree of freedom, over all runs and times.
 
     Innovations of a consistent filter are white, so the sum of NIS over time is chi-square too;
@@ -76,7 +77,7 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
     return Verdict(float(np.sum(nis[counts]) / total), float(low), float(high))
 
 
-def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, float]:
+def anees(values: np.ndarray, n: int, level: float = LEVEL) -> tuple[np.ndarray, np.ndarray, float]:
     """Average NEES over runs at each epoch, normalised by the state dimension n.
 
     Args:
@@ -117,7 +118,7 @@ def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
     return jax.vmap(one)(info.innovation, info.factor, info.used)
 
 
-def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdict:
+def whiteness(series: np.ndarray, lags: int = 20, level: float = LEVEL) -> Verdict:
     """Ljung-Box test for autocorrelation of a series (Ljung & Box 1978).
 
     Args:

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters import Code
+from robins.filters.consistency_limits import NIS_HIGH, REFUSED_SHARE
 from robins.ins.state import InsState
 from robins.program.scanned import mapped_rows, named_scan
 from robins.results import Variables, array, variable
@@ -24,7 +25,7 @@ from robins.systems.replaying import FilterEstimates
 from robins.systems.tables import place_arrays
 
 DIVERGED = "the estimate was off and took the word of positions that stayed away"
-NIS_MOST, FAR = 4.0, 6.0  # limits beyond which a replay is not to be trusted
+FAR = 6.0  # difference from the smoother beyond which a replay is not to be trusted [sigma]
 _OTHERS = {"velocity": "gnss.velocity_sigma", "place, velocity": "gnss.sigma, gnss.velocity_sigma"}
 _RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # rank of a quality, by its usual sigma
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
@@ -129,7 +130,7 @@ def fix_arrays(log: Log) -> Variables:
 def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: list[str]) -> str:
     """One-sentence verdict on a replay, from its first causal filter; "" without one.
 
-    "Do not trust" if sigmas are too small by a factor of two (NIS above `NIS_MOST`), more than a
+    "Do not trust" if sigmas are too small by a factor of two (NIS above `NIS_HIGH`), more than a
     third of the fixes was refused, the estimate diverged, or it is more than `FAR` sigmas from that
     of its smoother. "Consistent" if there is no warning and NIS is inside its 95 % band. Else
     "With care".
@@ -158,7 +159,12 @@ def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: li
     own = [one for one in doubts if one.startswith(f"{name}: ")]
     if own:
         parts.append(f"{len(own)} warning{'s' * (len(own) > 1)} below")
-    bad = nis > NIS_MOST or refused > count / 3 or far > FAR or any(DIVERGED in x for x in own)
+    bad = (
+        nis > NIS_HIGH
+        or refused > REFUSED_SHARE * count
+        or far > FAR
+        or any(DIVERGED in x for x in own)
+    )
     sound = low <= nis <= high and not own
     word = "Do not trust" if bad else "Consistent" if sound else "With care"
     return f"{word}: {name}, {', '.join(parts)}."

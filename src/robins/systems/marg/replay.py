@@ -20,7 +20,7 @@ from robins.dataset import AttitudeTable, Dataset
 from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
 from robins.errors import require_known
 from robins.filters import Code
-from robins.filters.tally import FEWEST
+from robins.filters.consistency_limits import FEWEST, REFUSED_SHARE
 from robins.filters.values import Numbers
 from robins.ins.frames import to_ned_frd
 from robins.results import Outcome, Progress, Variables, array, ignore_progress, variable
@@ -436,7 +436,7 @@ def _looks(
         if looked and not count:
             notes.append(f"{name}: the field was undisturbed at all {looked} looks.")
         elif looked:
-            unjudged = looked < FEWEST and count >= looked / 3
+            unjudged = looked < FEWEST and count >= REFUSED_SHARE * looked
             (warned if unjudged else notes).append(
                 f"{name}: the field was disturbed at {count} of {looked} looks; heading "
                 "then came from the gyros."
