@@ -87,7 +87,7 @@ def lay_out(city: City) -> GnssCourse:
         heading_rad=heading[1:],
         dt=dt,
         speed=way / dt,
-        yaw_rate=np.diff(heading) / dt,
+        yaw_rate=np.diff(np.asarray(heading, float)) / dt,
         way_m=np.cumsum(way),
     )
 
