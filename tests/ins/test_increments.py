@@ -253,3 +253,12 @@ def test_nothing_is_added_where_nothing_is_missing(stamps):
     # coning and sculling of the noise is all that may come on top
     np.testing.assert_allclose(inc.theta.sum(0), gyro[1:].sum(0), atol=2e-4)
     np.testing.assert_allclose(inc.dv.sum(0)[2], accel[1:].sum(0)[2], atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", ["rate", "increment"])
+def test_rows_integrated_in_parts_give_the_bits_of_all_together(monkeypatch, kind):
+    imu = Coning(0.3, 2.0).imu(np.delete(np.arange(300) / 100.0, [50, 51, 130]), kind)
+    together, _ = from_imu(imu)
+    monkeypatch.setattr("robins.ins.increments._ROWS", 32)
+    for part, whole in zip(from_imu(imu)[0], together, strict=True):
+        np.testing.assert_array_equal(part, whole)

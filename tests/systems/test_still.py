@@ -68,6 +68,14 @@ def _walk(rest_s, go_s, roll, pitch, heading_rest, course):
     return Log(increments, time, gnss, gnss_s, one, None, None, np.zeros(len(gnss_s), bool))
 
 
+def test_rest_sought_in_parts_is_that_of_the_whole(monkeypatch):
+    increments = _walk(8.0, 4.0, 0.2, -0.1, 0.5, 2.0).increments
+    together = standstill(increments, *Aids().quiet)
+    monkeypatch.setattr("robins.ins.rest._ROWS", 90)
+    for part, whole in zip(standstill(increments, *Aids().quiet), together, strict=True):
+        np.testing.assert_array_equal(part, whole)
+
+
 def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
     roll, pitch, course = 0.2, -0.1, 2.0
     log = _walk(8.0, 4.0, roll, pitch, 0.5, course)

@@ -42,6 +42,7 @@ from robins.rotation import multiply, normalise, rotate, to_rotvec
 _EVEN = 2.0  # largest ratio of neighbouring intervals for a cubic
 _OTHERS = [[j for j in range(4) if j != i] for i in range(4)]  # of four samples but one
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
+_ROWS = 1 << 16  # intervals integrated together: temporary arrays stay small in a long log
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
 
 
@@ -80,9 +81,13 @@ def from_imu(imu: ImuTable, usual_s: float | None = None) -> tuple[Increments, n
     _check(imu, time, gyro, accel)
     dt = np.diff(time) * 1e-9
     if imu.kind == "increment":
-        theta, dv, dr = _from_increments(dt, gyro, accel, usual_s)
+        points_of = _points_of_increments(dt, gyro, accel, usual_s)
     else:
-        theta, dv, dr = _from_rates(dt, gyro, accel)
+        points_of = _points_of_rates(dt, gyro, accel)
+    theta, dv, dr = (np.empty((len(dt), 3)) for _ in range(3))
+    for first in range(0, len(dt), _ROWS):
+        rows = slice(first, min(first + _ROWS, len(dt)))
+        theta[rows], dv[rows], dr[rows] = _integrate(dt[rows, None], *points_of(rows))
     return Increments(dt, theta, dv, dr), time[1:]
 
 
@@ -113,44 +118,53 @@ def _row(imu: ImuTable, k: int) -> str:
     return f"row {k}" if imu.rows is None else f"line {imu.rows[k]}"
 
 
-def _from_increments(dt, gyro, accel, usual_s):
-    """Line through the means of the previous and the present interval, at the Gauss points.
+def _points_of_increments(dt, gyro, accel, usual_s):
+    """Rate and force on the line through the means of two intervals, at the Gauss points of rows.
 
     Without a gap, a sample is the integral over its interval.
     """
-    h = dt[:, None]
     own = own_intervals(dt, gyro, accel, usual_s)[:, None]
-    middle = 1.0 - 0.5 * own[1:] / h  # middle of the sample's own interval, in units of h
-    points = []
-    for raw in (gyro, accel):
-        mean = raw / own
-        rise = (mean[1:] - mean[:-1]) / (middle + 0.5 * own[:-1] / h)  # over the interval
-        points.append([mean[1:] + (c - middle) * rise for c in _GAUSS])
-    return _integrate(h, *points)
+
+    def points_of(rows):
+        both = slice(rows.start, rows.stop + 1)  # with the sample before
+        h, lasted = dt[rows, None], own[both]
+        middle = 1.0 - 0.5 * lasted[1:] / h  # middle of the sample's own interval, in units of h
+        points = []
+        for raw in (gyro, accel):
+            mean = raw[both] / lasted
+            rise = (mean[1:] - mean[:-1]) / (middle + 0.5 * lasted[:-1] / h)  # over the interval
+            points.append([mean[1:] + (c - middle) * rise for c in _GAUSS])
+        return points
+
+    return points_of
 
 
-def _from_rates(dt, gyro, accel):
-    stencil, weights = _stencil(dt)
-    points = [[np.einsum("kn,knj->nj", w, x[stencil]) for w in weights] for x in (gyro, accel)]
-    return _integrate(dt[:, None], *points)
+def _points_of_rates(dt, gyro, accel):
+    """Rate and force on the cubic or the line through the samples, at the Gauss points of rows."""
+
+    def points_of(rows):
+        stencil, weights = _stencil(dt, rows)
+        return [[np.einsum("kn,knj->nj", w, x[stencil]) for w in weights] for x in (gyro, accel)]
+
+    return points_of
 
 
-def _stencil(dt):
-    """Four samples for each interval (4, N), and their weights for its two Gauss points.
+def _stencil(dt, rows):
+    """Four samples for each of K intervals (4, K), and their weights for its two Gauss points.
 
     The interval is the middle one of the three between them; an outer one at the table's ends.
     """
-    n = len(dt)
-    each, at = np.arange(n), np.arange(4)[:, None]
+    n, h = len(dt), dt[rows]
+    each, at = np.arange(rows.start, rows.stop), np.arange(4)[:, None]
     first = np.minimum(np.maximum(each - 1, 0), max(n - 3, 0))
     stencil = np.minimum(first + at, n)
     steps = dt[np.minimum(first + at[:3], n - 1)]
     even = (n >= 3) & (steps.max(0) <= _EVEN * steps.min(0))
-    knots = np.zeros((4, n))
+    knots = np.zeros((4, len(h)))
     np.cumsum(steps, 0, out=knots[1:])
     before = each - first  # which of the four is at the start of the interval
-    points = [knots[before, each] + c * dt for c in _GAUSS]
-    cubics = np.ones((len(points), 4, n))
+    points = [np.take_along_axis(knots, before[None], 0)[0] + c * h for c in _GAUSS]
+    cubics = np.ones((len(points), 4, len(h)))
     for i, others in enumerate(_OTHERS):
         gaps = np.where(even, knots[i] - knots[others], 1.0)
         for cubic, point in zip(cubics, points, strict=True):
@@ -240,10 +254,10 @@ def own_intervals(
     usual = usual_interval(dt) if usual_s is None else usual_s
     gap = after_gap(dt, usual)
     own = np.concatenate([np.where(gap[:1], usual, dt[:1]), dt])
-    both = np.hstack([theta, dv / _GRAVITY])
     for k in np.flatnonzero(gap) + 1:
-        before = both[k - 1] / own[k - 1]
-        alone, whole = (np.linalg.norm(both[k] / h - before) for h in (usual, own[k]))
+        before, last = np.hstack([theta[k - 1 : k + 1], dv[k - 1 : k + 1] / _GRAVITY])
+        before = before / own[k - 1]
+        alone, whole = (np.linalg.norm(last / h - before) for h in (usual, own[k]))
         if alone < whole:
             own[k] = usual
     return own

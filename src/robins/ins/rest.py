@@ -11,6 +11,8 @@ import numpy as np
 
 from robins.ins.increments import Increments
 
+_ROWS = 1 << 16  # samples searched together: temporary arrays stay small in a long log
+
 
 def moving_statistics(
     values: np.ndarray, width: int, first: int = 0
@@ -75,8 +77,23 @@ def standstill(
         Mask (N,) of standstill, mean gyro rate (N, 3) [rad/s] over the window, and unrest (N,): the
         largest standard deviation of any axis, in thresholds.
     """
+    usual_s = float(np.median(increments.dt)) if usual_s is None else usual_s
+    width = max(2, round(window_s / usual_s))
+    parts = []
+    for begin in range(0, max(len(increments.dt), 1), _ROWS):
+        since = max(begin - 2 * width, 0)  # with the samples that its windows need
+        part = Increments(*(a[since : begin + _ROWS] for a in increments[:3]))
+        found = _still(part, width, quiet_rate, quiet_force, first + since)
+        parts.append([a[begin - since :] for a in found])
+    still, mean_rate, unrest = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return still, mean_rate, unrest
+
+
+def _still(
+    increments: Increments, width: int, quiet_rate: float, quiet_force: float, first: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Standstill of a part of a record, see `standstill`; `width` is the number of samples."""
     dt, theta, dv = increments[:3]
-    width = max(2, round(window_s / (float(np.median(dt)) if usual_s is None else usual_s)))
     mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width, first)
     _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     still = np.all(spread_rate < quiet_rate, axis=1)

@@ -92,7 +92,9 @@ def refusals(
 
 
 def rows_where(table: Any, keep: np.ndarray) -> Any:
-    """A table of `robins.dataset` with the rows of a mask (n,)."""
+    """A table of `robins.dataset` with the rows of a mask (n,); the same one if it keeps all."""
+    if np.all(keep):
+        return table
     n = len(table.time_ns)
     arrays = {
         f.name: getattr(table, f.name)[keep]

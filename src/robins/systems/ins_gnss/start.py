@@ -204,11 +204,12 @@ def _levelled(
     dt, _, dv = log.increments[:3]
     still, mean_rate = at_rest(log, aids, usual, lenient=True)
     width = max(2, round(2.0 * aids.window / usual.sample_s))
-    mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing after the first rest is used
     end = min(int(np.searchsorted(log.time_s, until_s)), len(dt) - 1)
     enough = min(int(np.append(np.flatnonzero(still)[width : width + 1], end)[0]), end)
     last = enough if fast is None else _row(log, fast)
+    until = slice(last + 1)
+    mean_force, spread = moving_statistics(dv[until] / dt[until, None], width, log.first)
     quiet_enough = np.flatnonzero(still[: last + 1])
     if len(quiet_enough):
         at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
