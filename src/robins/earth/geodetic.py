@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins.earth.wgs84 import curvature_radii, ecef_from_geodetic, geodetic_from_ecef
+from robins.linalg.library import Real
 from robins.manifold import wrap
 
 
@@ -60,7 +61,7 @@ class Geodetic:
         lat, lon, alt = geodetic_from_ecef(jnp.asarray(r_e, float))
         return cls(lat, wrap(lon), alt)
 
-    def as_ecef(self) -> Float[Array, "*b 3"]:
+    def as_ecef(self) -> Float[Real, "*b 3"]:
         """Earth-fixed position r_e [m]."""
         return ecef_from_geodetic(self.lat, self.lon, self.alt)
 
