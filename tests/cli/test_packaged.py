@@ -25,7 +25,6 @@ from robins import results, scenario
 from robins.bench.rigs.satellite import config
 from robins.campaign.monte_carlo import _each, _records, contender
 from robins.cli import ExitStatus, app, main
-from robins.program import BuildError
 from robins.report import numbers
 from robins.systems import SYSTEMS
 from robins.workbench.scenarios import read_scenario, with_default_filter
@@ -295,9 +294,10 @@ def as_short_as_can_be(words):
 
 # Of these commands, which begin to compute when this is called, one line of each kind is computed:
 # that with the most options. Packaged scenarios run above, and `test_cli_bound.py` computes bounds.
+PROBLEM = "robins.workbench.scenarios:Simulated.problem"  # any command that simulates
 BEGINS = {
-    ("run",): "robins.workbench.run:simulate",
-    ("bound",): "robins.workbench.bound:bound_of",
+    ("run",): PROBLEM,
+    ("bound",): PROBLEM,
     ("allan",): "robins.workbench.allan:deviation",
     ("design",): "robins.workbench.design:trade_off",
     ("replay",): "robins.workbench.replay:part",
@@ -310,11 +310,11 @@ BEGINS = {
     ("sweep",): "robins.workbench.sweep:plan_campaign",
     ("tune",): "robins.workbench.tune:choose",
     ("sensitivity",): "robins.workbench.sensitivity:simulate_points",
-    ("bench", "up"): "robins.bench.run.session:Session.run",
+    ("bench", "up"): "robins.workbench.bench:Session",
     ("bench", "replay"): "robins.workbench.bench:config_of",
     ("export",): "robins.workbench.export:files_of",
     ("export", "--adjust"): "robins.workbench.export:files_of",
-    ("export", "--board"): "robins.workbench.export:files_of",
+    ("export", "--board"): "robins.workbench.export:_request_for_rig",
 }
 # The option that makes a command compute something else.
 OPTIONS = ("--master", "--system", "--diff", "--adjust", "--board")
@@ -404,10 +404,6 @@ def computes(folder, sketched, unchecked, monkeypatch, capsys):
     return to_the_end
 
 
-def no_interpreter():
-    raise BuildError("there is none")
-
-
 @pytest.mark.parametrize("words", SHOWN, ids=SHOWN.values())
 def test_a_command_line_shown_runs(words, folder, computes, monkeypatch):
     kind = kind_of(words)
@@ -417,13 +413,11 @@ def test_a_command_line_shown_runs(words, folder, computes, monkeypatch):
         computes(words)
     else:
         monkeypatch.chdir(folder)
-        module, _, name = BEGINS[kind].partition(":")
-        owner, _, name = name.rpartition(".")
-        of = pkgutil.resolve_name(f"{module}:{owner}" if owner else module)
-        monkeypatch.setattr(of, name, begins)
-        # Programs are traced before they begin, batches of JAX are not.
-        monkeypatch.setattr("robins.campaign.machine.interpreter_of_many", no_interpreter)
-        monkeypatch.setattr("robins.campaign.machine.available_cores", lambda: 1)
+        for path in (PROBLEM, BEGINS[kind]):
+            module, _, name = path.partition(":")
+            owner, _, name = name.rpartition(".")
+            of = pkgutil.resolve_name(f"{module}:{owner}" if owner else module)
+            monkeypatch.setattr(of, name, begins)
         with pytest.raises(BeginsError):
             main([BUILT.get(word, word) for word in words])
 
