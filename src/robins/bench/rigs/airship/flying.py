@@ -20,6 +20,7 @@ from robins.bench.wire.fields import Values
 from robins.earth import Geodetic
 from robins.filters import Belief, Model, OnlineFilter, run
 from robins.filters.kalman import FilterState
+from robins.filters.machine import usual
 from robins.filters.run import Step
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -123,7 +124,8 @@ def navigation(config: AirshipConfig) -> Part:
 
     @cache
     def made() -> tuple[OnlineFilter, FilterState]:  # not needed to query the inputs
-        online = OnlineFilter(CANDIDATES[config.filter].make(), config.model, config.start)
+        filter_ = CANDIDATES[config.filter].make()
+        online = OnlineFilter(filter_, config.model, config.start, usual())
         return online, online.state
 
     def first() -> tuple[FilterState, Increments]:
