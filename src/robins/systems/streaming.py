@@ -240,12 +240,35 @@ class Live:
     _on: Callable[[Belief | FilterState], OnlineFilter]  # the filter from an initial state
     _compiled_state: PyTree = None  # a filter state, for its structure and shapes
     _online: OnlineFilter | None = None  # set at the start
+    _declares_gaps: ClassVar[bool] = False  # counts a gap that is too long under another name
 
-    def __init__(self, parameters: Parameters, **made_with: Any):
-        """Store the constructor's arguments, for the file."""
+    def __init__(self, parameters: Parameters, gap_s: float, patience: int, **made_with: Any):
+        """Store the constructor's arguments, for the file, and those of the `TimestampGate`."""
         self.parameters: Any = parameters
         self.counts: Counter[str] = Counter()
-        self._made_with = made_with
+        self._made_with, self._gate_settings = made_with, (gap_s, patience)
+
+    def start_over(self) -> None:
+        """Reset the object: discard samples, measurements, state and counts."""
+        self._gate = TimestampGate(*self._gate_settings)
+        self.counts.clear()
+        self._restart()
+
+    def _restart(self) -> None:
+        """Reset all but the counts and the stamps."""
+        raise NotImplementedError
+
+    def _accepts(self, kind: str, time_ns: int, values: np.ndarray) -> bool:
+        """Count a refused sample; start again after a long gap, or where the clock was set."""
+        last_ns = self._gate.last_ns
+        why = self._gate.check(time_ns, values)
+        if why == "anew":
+            is_gap = self._declares_gaps and last_ns is not None and time_ns > last_ns
+            self.counts["imu_gaps_declared" if is_gap else "begun_anew"] += 1
+            self._restart()
+        elif why:
+            self.counts[f"{kind}_{why}"] += 1
+        return why in ("", "anew")
 
     def doubts(self) -> list[str]:
         """Sentences on reasons to doubt the last 400 updates of each sensor, as in a replay.

@@ -38,7 +38,6 @@ from robins.systems.streaming import (
     Flag,
     Live,
     LiveError,
-    TimestampGate,
     numbers,
     online,
     stamp,
@@ -170,15 +169,9 @@ class LiveGnss(Live):
         made_with = {"channels": dict(channels), "filter": filter, "wait_s": wait_s}
         made_with["longest_delay_s"] = longest_delay_s
         made_with |= {"machine": machine or usual()}
-        super().__init__(parameters, **made_with)
+        super().__init__(parameters, _GAP_S, _PATIENCE, **made_with)
         self.start_over()
         self._compile()
-
-    def start_over(self) -> None:
-        """Be as new: without records and counts."""
-        self._gate = TimestampGate(_GAP_S, _PATIENCE)
-        self.counts.clear()
-        self._restart()
 
     def _restart(self) -> None:
         """Forget all but the counts and the stamps."""
@@ -213,18 +206,11 @@ class LiveGnss(Live):
         self.passed, time = [], stamp(time_ns)
         given = [speed_mps, yaw_rate, sigma_speed, sigma_yaw]
         row = numbers("speed_mps, yaw_rate, sigma_speed, sigma_yaw", given, 4)
-        if not np.all(np.isfinite(row)):
-            why = "nan"
-        elif abs(row[0]) > _FASTEST or np.any(row[2:] <= 0.0):
+        why = "" if np.all(np.isfinite(row)) else "nan"
+        if not why and (abs(row[0]) > _FASTEST or np.any(row[2:] <= 0.0)):
             why = "absurd"
-        else:
-            why = self._gate.check(time, np.array([row[1], 0.0, 0.0, 0.0, 0.0, 0.0]))
-        if why == "anew":
-            self.counts["begun_anew"] += 1
-            self._restart()
-            why = ""
-        if why:
-            self.counts[f"odometry_{why}"] += 1
+        self.counts.update([f"odometry_{why}"] if why else [])
+        if why or not self._accepts("odometry", time, np.array([row[1], 0.0, 0.0, 0.0, 0.0, 0.0])):
             return self._answer(Flag.REFUSED)
         self._path.push_odometry(np.array([time]), row[None])
         self._advance()

@@ -51,7 +51,6 @@ from robins.systems.streaming import (
     Live,
     LiveError,
     MeasurementOutcome,
-    TimestampGate,
     numbers,
     online,
     outcomes_of,
@@ -135,7 +134,8 @@ class LiveInsGnss(Live):
     _kept: ClassVar[tuple[str, ...]] = (
         "_past", "_counted", "_last_step", "start", "_begun_s",
     )  # fmt: skip
-    _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
+    _parts: ClassVar[tuple[str, ...]] = ("_gate", "_path")
+    _declares_gaps = True
     _assumed = ASSUMED
 
     def __init__(
@@ -171,7 +171,7 @@ class LiveInsGnss(Live):
         require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
         made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
         made_with |= {"longest_delay_s": longest_delay_s, "machine": machine or usual()}
-        super().__init__(parameters, **made_with)
+        super().__init__(parameters, longest_s, max(3, round(_PATIENCE_S * rate_hz)), **made_with)
         self._usual = UsualIntervals(1.0 / rate_hz, 1.0 / fix_rate_hz)
         self._delay_s = longest_delay_s
         asked = contender(parameters, self._usual.fix_s, filter)
@@ -179,15 +179,8 @@ class LiveInsGnss(Live):
         self._case, self._suspects = asked.case, asked.filter.suspects
         orientation = parameters.imu.orientation
         self._C_bs = axes_of(orientation) if any(orientation) else None
-        self._patience = max(3, round(_PATIENCE_S * rate_hz))
         self.start_over()
         self._compile()
-
-    def start_over(self) -> None:
-        """Reset the object: discard samples, fixes, state and counts."""
-        self._door = TimestampGate(self.parameters.update.longest_gap, self._patience)
-        self.counts.clear()
-        self._restart()
 
     def _restart(self) -> None:
         """Reset all but the counts and the stamps."""
@@ -218,13 +211,7 @@ class LiveInsGnss(Live):
         self.passed, time = [], stamp(time_ns)
         values = np.stack([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
         field = None if field_t is None else numbers("field", field_t, 3)
-        why = self._door.check(time, values.ravel())
-        if why == "anew":
-            later = any(time > self._path.imu.time_ns[-1:])
-            self.counts["imu_gaps_declared" if later else "begun_anew"] += 1
-            self._restart()
-        elif why:
-            self.counts[f"imu_{why}"] += 1
+        if not self._accepts("imu", time, values.ravel()):
             return self._answer(time, Flag.REFUSED)
         if self._C_bs is not None:
             values = turned(self._C_bs, values)

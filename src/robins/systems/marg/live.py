@@ -47,7 +47,6 @@ from robins.systems.streaming import (
     Flag,
     Live,
     LiveError,
-    TimestampGate,
     numbers,
     online,
     refuse_field_unit,
@@ -116,7 +115,7 @@ class LiveMarg(Live):
         "_field", "_far", "_pending", "_looks", "_since", "_q", "_sigma", "_bias", "_gain",
         "_marks", "_starting", "_open",
     )  # fmt: skip
-    _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
+    _parts: ClassVar[tuple[str, ...]] = ("_gate", "_path")
     _assumed = tuple(model.SENSORS)
 
     def __init__(
@@ -141,13 +140,13 @@ class LiveMarg(Live):
         require(rate_hz > 0.0, "rate_hz must be positive", rate_hz)
         machine = machine or usual()
         made_with = {"rate_hz": rate_hz, "declination_rad": declination_rad, "machine": machine}
-        super().__init__(parameters, **made_with)
+        patience = max(3, round(_PATIENCE_S * rate_hz))
+        super().__init__(parameters, _LONGEST_GAP_S, patience, **made_with)
         p, self._usual_s = parameters, 1.0 / rate_hz
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
         self._on = partial(online, filter_of(p), model.model_of(p), machine=machine)
-        self._door = TimestampGate(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
-        self._restart()
+        self.start_over()
         self._compile()
 
     def _restart(self) -> None:
@@ -178,8 +177,7 @@ class LiveMarg(Live):
         self._online = self._on(found[1])
         self._compiled_state = self._online.state
         self._step()
-        self.counts.clear()
-        self._restart()
+        self.start_over()
 
     # ------------------------------------------------------------------------------ a sample
 
@@ -200,12 +198,7 @@ class LiveMarg(Live):
         gyro, accel = numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)
         self._read_field(field_t)
         values = np.concatenate([gyro, accel])
-        why = self._door.check(time, values)
-        if why == "anew":
-            self.counts["begun_anew"] += 1
-            self._restart()
-        elif why:
-            self.counts[f"imu_{why}"] += 1
+        if not self._accepts("imu", time, values):
             return self._answer(time, Flag.REFUSED)
         row = np.concatenate([values, self._field])
         self._field = np.full(3, np.nan)

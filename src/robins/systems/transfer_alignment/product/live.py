@@ -35,7 +35,6 @@ from robins.systems.streaming import (
     Live,
     LiveError,
     MeasurementOutcome,
-    TimestampGate,
     numbers,
     online,
     outcomes_of,
@@ -114,6 +113,7 @@ class LiveAlignment(Live):
     _parameters: ClassVar[type[PairReplay]] = PairReplay
     _kept: ClassVar[tuple[str, ...]] = ("_last_step", "_at", "_checked")
     _parts: ClassVar[tuple[str, ...]] = ("_gate", "_path")
+    _declares_gaps = True
 
     def __init__(
         self,
@@ -142,20 +142,14 @@ class LiveAlignment(Live):
         what = f"recording.longest_gap, {longest_s:g} s, must be 1.5 sampling intervals or more, at"
         require(rate_hz * longest_s > 1.5, f"{what} {rate_hz:g} Hz {1.5 / rate_hz:.3g} s")
         made_with = {"rate_hz": rate_hz, "filter": filter, "longest_delay_s": longest_delay_s}
-        super().__init__(parameters, **made_with, machine=machine or usual())
+        patience = max(3, round(_PATIENCE_S * rate_hz))
+        super().__init__(parameters, longest_s, patience, **made_with, machine=machine or usual())
         asked = contender(parameters, filter)
         self._on = partial(online, asked.filter, asked.model, machine=machine or usual())
         self._case, self._suspects = asked.case, asked.filter.suspects
         self._matched, self._usual_s = sorted(asked.model.dims), 1.0 / rate_hz
         self.start_over()
         self._compile()
-
-    def start_over(self) -> None:
-        """Reset the object: discard samples, records, state and counts."""
-        patience = max(3, round(_PATIENCE_S / self._usual_s))
-        self._gate = TimestampGate(self.parameters.recording.longest_gap, patience)
-        self.counts.clear()
-        self._restart()
 
     def _restart(self) -> None:
         """Reset all but the counts and the stamps."""
@@ -182,13 +176,7 @@ class LiveAlignment(Live):
         """
         self.passed, time = [], stamp(time_ns)
         values = np.concatenate([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
-        why = self._gate.check(time, values)
-        if why == "anew":
-            later = any(time > self._path.imu.time_ns[-1:])
-            self.counts["imu_gaps_declared" if later else "begun_anew"] += 1
-            self._restart()
-        elif why:
-            self.counts[f"imu_{why}"] += 1
+        if not self._accepts("imu", time, values):
             return self._answer(time, Flag.REFUSED)
         self._path.push(self._path.imu.push(np.array([time]), values[None]))
         self._advance()
