@@ -15,7 +15,7 @@ from robins.bench.wire.c_header import firmware
 from robins.dataset import ImuTable
 from robins.results import Outcome
 from robins.systems import SYSTEMS
-from robins.systems.catalogue import configurations
+from robins.systems.catalogue import replay_files
 from robins.systems.ins_gnss import Drive, drive_dataset
 from robins.systems.transfer_alignment.product.parameters import PairReplay
 from robins.workbench import campaign_work, plan_campaign, publish
@@ -84,7 +84,7 @@ def write_files(here):
     still = rng.normal(size=(2, 3000, 3)) * [[[1e-3]], [[5e-3]]] + [[[0, 0, 0]], [[0, 0, -9.81]]]
     stamps = np.arange(3000) * 10_000_000
     logs.write_log(here / "still.csv", ImuTable(stamps, still[0], still[1], "rate"))
-    pair = configurations("transfer-alignment")["replay"].read_text()
+    pair = replay_files("transfer-alignment")["replay"].read_text()
     (here / "my-pair.toml").write_text(pair)
     dataset = pair_dataset(scenario.parse(PairReplay, pair, ["slave.rate=20 Hz"]), seed=3)
     logs.write_log(here / "master.csv", dataset.master)

@@ -49,8 +49,8 @@ euler = compiled(rot.to_euler)
 from_euler = compiled(rot.from_euler)
 
 
-def scipy_wxyz(rotation):
-    """scipy holds x, y, z, w."""
+def scalar_first(rotation):
+    """Quaternion of a SciPy rotation with the scalar first; SciPy has it last."""
     return rotation.as_quat()[..., [3, 0, 1, 2]]
 
 
@@ -95,7 +95,7 @@ def test_logarithm_inverts_exponential_to_relative_rounding(sizes):
 
 
 def test_exponential_is_that_of_scipy_and_of_the_matrix(quaternions):
-    expected = scipy_wxyz(Scipy.from_rotvec(EVERY))
+    expected = scalar_first(Scipy.from_rotvec(EVERY))
     np.testing.assert_array_less(angle_between(quaternions, expected), 4 * EPS)
     matrices = scipy.linalg.expm(np.asarray(rot.skew(jnp.asarray(EVERY))))
     np.testing.assert_allclose(dcm(quaternions), matrices, atol=2e-14)  # the error of expm
@@ -140,7 +140,7 @@ def test_euler_angles_are_those_of_scipy():
     pitch = np.deg2rad(rng.uniform(-89, 89, 200))
     q = from_euler(roll, pitch, heading)
     expected = Scipy.from_euler("ZYX", np.stack([heading, pitch, roll], -1))
-    np.testing.assert_array_less(angle_between(q, scipy_wxyz(expected)), 4 * EPS)
+    np.testing.assert_array_less(angle_between(q, scalar_first(expected)), 4 * EPS)
     for ours, given in zip(euler(q), (roll, pitch, heading), strict=True):
         np.testing.assert_allclose(ours, given, atol=1e-13)
 

@@ -98,6 +98,7 @@ MOVED: dict[str, dict[str, tuple[str, ...]]] = {
         "constrain": ("robins.filters.limits", "constrain"),
         "information_sum": ("robins.filters", "fuse"),
     },
+    "robins.filters.analysis": {"worded": ("robins.filters.analysis", "direction_in_words")},
     "robins.bench.rig": {
         old: ("robins.bench.evaluation", name)
         for old, name in (

@@ -29,7 +29,7 @@ def test_a_run_that_fails_before_its_first_step_is_a_result(tmp_path, monkeypatc
     assert told["failure"].startswith("no hello from counter in 0.2 s: is it connected, ")
     assert (told["steps"], told) == (0, json.loads((out / "bench.json").read_text()))
     record = read_record(out / "record.mcap")
-    assert (record.whole, record.events[-1].text) == (True, told["failure"])
+    assert (record.complete, record.events[-1].text) == (True, told["failure"])
 
 
 def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypatch, capsys):
@@ -66,6 +66,6 @@ def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypa
     assert not any(alive(pid) for pid in pids)
     assert not out.exists()
     record = read_record(f"{out}.record.mcap")  # what was flown is not lost
-    assert record.whole
+    assert record.complete
     assert len(record.entries) > 10
     assert status().startswith("No bench runs.")

@@ -138,7 +138,7 @@ def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
 def test_the_record_holds_all_that_went_over_the_links(plain):
     done, path = plain
     record = read_record(path)
-    assert record.whole
+    assert record.complete
     assert record.header["steps"] == 280
     said: dict[tuple[str, str], list[Frame]] = {}
     for entry in record.entries:
@@ -183,7 +183,7 @@ def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
         assert event.received_ns - killed_at[part] < 2e9
         assert "SIGKILL" in event.text
     record = read_record(tmp_path / "r.mcap")
-    assert record.whole
+    assert record.complete
     told = [e.text.split(" told ")[1] for e in record.events if e.kind == "restarted"]
     assert told == ["all again"] * 3 + ["all since step 255 again"] * 4
 
@@ -214,7 +214,7 @@ def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(failed):
     assert done.off == 0.0  # as far as it went
     assert done.watch.events[-1][0] == "failed"
     record = read_record(path)
-    assert record.whole
+    assert record.complete
     assert record.events[-1].kind == "failed"
 
 
@@ -258,7 +258,7 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
         time.sleep(0.05)
     assert not any(alive(pid) for pid in pids)
     record = read_record(tmp_path / "k.mcap")
-    assert not record.whole
+    assert not record.complete
     assert len(record.entries) > 100
 
 
@@ -279,7 +279,7 @@ def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path,
     assert "File too large" in result.failure
     assert 100 <= result.steps < 200
     record = read_record(path)
-    assert not record.whole
+    assert not record.complete
     assert len(record.entries) > 100
 
 
@@ -390,9 +390,9 @@ def test_a_part_may_be_a_board_on_a_real_port(threads, tmp_path):
     """Here the board is a process started by hand, at the other end of a cable."""
     scenario = tmp_path / "short.toml"
     scenario.write_text(f'bench = "satellite"\nseconds = "5 s"\nset = {json.dumps(LOOP)}\n')
-    whole = read(str(scenario))
+    complete = read(str(scenario))
     with cable() as ends, board("gyro", ends.board, str(scenario)) as process:
-        of = changed(whole, {"ports": {"gyro": ends.bench}})
+        of = changed(complete, {"ports": {"gyro": ends.bench}})
         result = Session(of).run()
         assert result.failure == ""
         assert result.steps == 50

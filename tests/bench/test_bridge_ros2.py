@@ -83,13 +83,13 @@ def start():
         process.wait()
 
 
-def until_heard(topics, topic, time_ns):
-    """The other side needs a moment to subscribe; what is sent before is not kept."""
+def until_heard(talker, topic, listener, answers, time_ns):
+    """Publish until something arrives; what is sent before the other side subscribes is lost."""
     end = time.monotonic() + 20.0
-    topics.publish(topic, imu(), time_ns)
-    while not topics.has_subscriber(topic):
+    talker.publish(topic, imu(), time_ns)
+    while listener.take(answers, 0.05) is None:
         assert time.monotonic() < end, "nobody subscribed"
-        time.sleep(0.01)
+        talker.publish(topic, imu(), time_ns)
 
 
 @pytest.mark.parametrize("convention", KEY)
@@ -98,7 +98,7 @@ def test_two_processes_talk(endpoint, start, convention):
         topics.subscribe("/imu/back", ros.Imu)
         for flight in range(2):  # the other side goes and comes back
             process = start(endpoint, convention)
-            until_heard(topics, "/imu/data", 1_000_000_000)
+            until_heard(topics, "/imu/data", topics, "/imu/back", 1_000_000_000)
             while topics.take("/imu/back", 0.2):
                 pass
             for k in range(2, 152):
@@ -129,7 +129,7 @@ def test_bytes_that_are_no_message_are_counted(endpoint):
         Ros2Topics(convention="ros2dds", connect=[endpoint]) as theirs,
     ):
         ours.subscribe("/imu", ros.Imu)
-        until_heard(theirs, "/imu", 5)
+        until_heard(theirs, "/imu", ours, "/imu", 5)
         theirs._session.put("imu", b"\0\1\0\0nothing")
         theirs.publish("/imu", imu(), 6)
         seen = [ours.take("/imu", 5.0).time_ns]

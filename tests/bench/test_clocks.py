@@ -38,7 +38,7 @@ def test_lock_step_waits_for_nobody():
     clock = LockStep()
     assert clock.wait(3, lambda seconds: pytest.fail("it waited")) is None
     assert clock.over(3) is False
-    assert clock.patience_ns is None
+    assert clock.timeout_ns is None
     clock.rested(10**9)
 
 
@@ -50,7 +50,7 @@ def test_deadlines_are_of_the_grid_however_long_steps_take(wall):
         wall.ns += 3_000_000 if k % 7 else 9_000_000
         assert not clock.over(k)
     assert [b - a for a, b in itertools.pairwise(found)] == [10_000_000] * 49
-    assert clock.patience_ns == 10_000_000
+    assert clock.timeout_ns == 10_000_000
 
 
 def test_a_long_step_is_caught_up_with_or_skipped(wall):

@@ -109,7 +109,7 @@ def test_memory_does_not_grow_and_the_record_is_whole(day):
     (bench,) = (x for name, x in memories.of.items() if "robins.cli" in name)
     assert max(bench) - bench[len(bench) // 24] < 100.0  # with figures and report, in the end
     record = open_record(out / "record.mcap")
-    assert (record.whole, record.why) == (True, "")
+    assert (record.complete, record.why) == (True, "")
     heard = Memories(os.getpid())
     heard.start()
     compared = bench_replay(out / "record.mcap", node="camera")

@@ -88,17 +88,17 @@ class Board:
             select.select([], [self.pair.master], [])
             data = data[os.write(self.pair.master, data) :]
 
-    def frame(self, patience_s: float = 3.0) -> Frame | None:
+    def frame(self, timeout_s: float = 3.0) -> Frame | None:
         """The next frame of this run; a hello that was on its way when begin was sent is not."""
-        end = time.monotonic() + patience_s
+        end = time.monotonic() + timeout_s
         while not self.waiting and (left := end - time.monotonic()) > 0:
             if select.select([self.pair.master], [], [], left)[0]:
                 found = self.receiver.feed(os.read(self.pair.master, 65536))
                 self.waiting += [one for one in found if one.header.run == self.run]
         return self.waiting.pop(0) if self.waiting else None
 
-    def got(self, name: str, patience_s: float = 3.0) -> tuple[Header, dict]:
-        one = self.frame(patience_s)
+    def got(self, name: str, timeout_s: float = 3.0) -> tuple[Header, dict]:
+        one = self.frame(timeout_s)
         assert one is not None, f"no {name} came"
         assert WIRE.message(one.header.type).name == name
         return one.header, WIRE.decode(name, one.payload)
@@ -158,7 +158,7 @@ def test_it_says_hello_until_it_is_answered(board):
     assert board.got("hello")[0].sequence == 1
     assert 0.3 < time.monotonic() - began < 1.0
     board.begin(run=7)
-    assert board.frame(patience_s=0.7) is None
+    assert board.frame(timeout_s=0.7) is None
 
 
 def test_its_samples_are_the_turns_of_the_table(board):

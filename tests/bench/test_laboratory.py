@@ -275,7 +275,7 @@ def test_a_part_without_power_has_lost_its_state_and_its_history(
         values = result.series[f"{message}.{field}"][there]
         np.testing.assert_array_equal(values, rows(wanted, message, field))
     again = bench_replay(tmp_path / "r.mcap", node="adm")
-    assert (again.same, again.whole) == (True, True)
+    assert (again.same, again.complete) == (True, True)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

@@ -34,10 +34,10 @@ def part(pair):
         yield part
 
 
-def take(master: int, count: int, patience_s: float = 5.0) -> bytes:
+def take(master: int, count: int, timeout_s: float = 5.0) -> bytes:
     """Bytes from the bench's end, which does not block."""
     got = bytearray()
-    end = time.monotonic() + patience_s
+    end = time.monotonic() + timeout_s
     while len(got) < count and time.monotonic() < end:
         if select.select([master], [], [], 0.1)[0]:
             got += os.read(master, 65536)
@@ -133,7 +133,7 @@ def test_every_byte_passes_unchanged_both_ways(pair, part):
     assert take(pair.master, 256) == EVERY_BYTE
     put(pair.master, EVERY_BYTE)
     assert part.read(256) == EVERY_BYTE
-    assert take(pair.master, 1, patience_s=0.05) == b""  # no echo
+    assert take(pair.master, 1, timeout_s=0.05) == b""  # no echo
 
 
 def test_every_byte_passes_before_a_part_opens_it(pair):
@@ -158,7 +158,7 @@ def test_a_megabyte_both_ways_at_once(pair, part):
     ]
     for thread in threads:
         thread.start()
-    assert take(pair.master, len(from_part), patience_s=20.0) == from_part
+    assert take(pair.master, len(from_part), timeout_s=20.0) == from_part
     for thread in threads:
         thread.join(20.0)
     assert got == to_part

@@ -29,7 +29,7 @@ def told(capsys, *arguments: str) -> tuple[int, dict]:
 
 def test_the_record_has_what_it_is_for():
     record = read_record(RECORD)
-    assert record.whole
+    assert record.complete
     said = [(WIRE.message(f.header.type).name, f.payload) for f in recorded(record.entries, "adm")]
     flags = [WIRE.decode(name, p)["flags"] for name, p in said if name == "estimate"]
     assert len(flags) == STEPS
@@ -55,7 +55,7 @@ def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    whole = list(recorded(record.entries, "adm"))
+    complete = list(recorded(record.entries, "adm"))
     at_once, each = read_record(damaged), open_record(damaged)
     assert 0 < len(at_once.entries) < len(record.entries)
     for _ in range(2):  # as often as it is wanted
@@ -74,7 +74,7 @@ def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
         assert main([*command, "--json"]) == 1
         said = json.loads(capsys.readouterr().out)
         assert (said["whole"], said["planned_s"]) == (False, 8.0)
-    assert 0 < len(list(recorded(at_once.entries, "adm"))) < len(whole)
+    assert 0 < len(list(recorded(at_once.entries, "adm"))) < len(complete)
     assert main(["bench", "replay", str(RECORD), "--node", "adm", "--diff", str(RECORD)]) == 0
     assert "Same: 'adm' says the same" in capsys.readouterr().out
 

@@ -130,7 +130,7 @@ def test_flush_hands_over_what_there_is(tmp_path):
     assert here[1:4] == (*split(some), False)
     assert here.why == f"ends at byte {path.stat().st_size} without having been closed"
     recorder.close()
-    assert read_record(path).whole
+    assert read_record(path).complete
 
 
 # -------------------------------------------------------------------------------- other tools
@@ -249,7 +249,7 @@ def test_a_file_cut_anywhere_gives_what_comes_before(tmp_path):
         except RecordingError as error:
             refused.append((cut, str(error)))
             continue
-        assert (back.header, back.whole) == (HEADER, False)
+        assert (back.header, back.complete) == (HEADER, False)
         assert back.why == f"ends at byte {cut} without having been closed"
         assert len(back.entries) + len(back.events) == np.sum(end <= cut)
         assert is_beginning(back.entries, back.events, some)
@@ -277,7 +277,7 @@ def test_a_flipped_bit_gives_what_comes_before_it(tmp_path):
         except RecordingError as error:
             refused.append((at, str(error)))
             continue
-        assert (back.header, back.whole) == (HEADER, False)
+        assert (back.header, back.complete) == (HEADER, False)
         assert back.why
         assert is_beginning(back.entries, back.events, some)
         kept = len(back.entries) + len(back.events)
@@ -307,7 +307,7 @@ def test_heads_of_chunks_that_are_flipped_hide_no_other_damage(tmp_path):
             data[time] ^= 1
             path.write_bytes(data)
             back = read_record(path)
-            assert (back.header, back.whole) == (HEADER, False)
+            assert (back.header, back.complete) == (HEADER, False)
             assert is_beginning(back.entries, back.events, some)
             damaged += "is damaged" in back.why
     assert damaged > 0.8 * 8 * CHUNK.size
@@ -359,7 +359,7 @@ def test_a_killed_recorder_loses_a_quarter_of_a_second(tmp_path):
     path = tmp_path / "a.mcap"
     assert run_child(path, "killed").returncode == -signal.SIGKILL
     back = read_record(path)
-    assert not back.whole
+    assert not back.complete
     assert 2000 - 251 <= len(back.entries) < 2000
     assert [one.received_ns for one in back.entries] == [k * MS for k in range(len(back.entries))]
 
@@ -375,7 +375,7 @@ def test_a_full_disk_is_said_once(tmp_path):
     assert (told, count) == (1, 2000)
     assert path.stat().st_size == 60_000  # up to the last byte there was room for
     back = read_record(path)
-    assert not back.whole
+    assert not back.complete
     assert len(back.entries) >= count - lost  # half a chunk may be there too
     assert len(back.entries) > 500
     assert [one.received_ns for one in back.entries] == [k * MS for k in range(len(back.entries))]
@@ -395,7 +395,7 @@ def test_records_that_cannot_be_begun(tmp_path):
     record(path, [])
     with pytest.raises(RecordingError, match=r"a\.mcap' is there already: give another name"):
         Recorder(path, WIRE, HEADER)
-    assert read_record(path).whole
+    assert read_record(path).complete
     assert record(path, messages(3), overwrite=True)
     assert len(read_record(path).entries) == 3
     with pytest.raises(RecordingError, match=r"header of .*: JSON cannot hold it"):

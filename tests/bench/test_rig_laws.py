@@ -150,7 +150,7 @@ def test_its_record_is_replayed(fly, name, monkeypatch):
     on_threads(monkeypatch)
     for part in TABLE[name].replays:
         found = bench_replay(record, node=part)
-        assert (found.same, found.whole) == (True, True)
+        assert (found.same, found.complete) == (True, True)
         assert found.frames >= 20
 
 

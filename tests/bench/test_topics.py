@@ -267,7 +267,7 @@ def test_frames_and_events_come_back_without_the_topics(made, tmp_path):
     some, content = made
     (tmp_path / "a.mcap").write_bytes(content)
     back = read_record(tmp_path / "a.mcap")
-    assert back.whole
+    assert back.complete
     assert back.entries == [one for one in some if isinstance(one, Entry)]
     assert back.events == [one for one in some if isinstance(one, Event)]
     plain = record(tmp_path / "plain.mcap", some, rows=())
@@ -290,7 +290,7 @@ def test_a_record_cut_anywhere_gives_what_comes_before(made, tmp_path):
         path.write_bytes(content[:cut])
         back = read_record(path)
         assert back.entries == entries[: len(back.entries)]
-        assert not back.whole
+        assert not back.complete
         kept.append(len(back.entries))
     assert kept == sorted(kept)
     assert kept[0] < 20
@@ -317,7 +317,7 @@ def test_a_killed_recorder_leaves_topics_that_can_be_decoded(tmp_path):
     assert result.returncode == -signal.SIGKILL, result.stderr
     back = read_record(path)
     entries = [one for one in some if isinstance(one, Entry)]
-    assert not back.whole
+    assert not back.complete
     assert back.entries == entries[: len(back.entries)]
     steps = len(back.entries) / 8
     assert 300 - 6 < steps <= 300  # a step takes 0.1 s, and a quarter of a second may be lost
@@ -325,9 +325,9 @@ def test_a_killed_recorder_leaves_topics_that_can_be_decoded(tmp_path):
     with contextlib.suppress(EndOfFile):  # the file was not closed
         for one in reader.iter_messages("/imu", log_time_order=False):
             found.append(one)
-    whole = sent(some, "gyro")[: len(found)]
+    complete = sent(some, "gyro")[: len(found)]
     assert len(found) in (math.floor(steps), math.ceil(steps))
-    for (_, _, m), (_, head, _) in zip(found, whole, strict=True):
+    for (_, _, m), (_, head, _) in zip(found, complete, strict=True):
         assert (m.publish_time, len(m.data)) == (head.time_ns, 28 + 37 * 8)
 
 

@@ -97,7 +97,7 @@ def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeyp
     for one in missing(store, plan.shards)[::2]:
         store.put(one.claim, b"")
     monkeypatch.setattr("robins.campaign.work.LEAST_S", 0.0)
-    monkeypatch.setattr("robins.campaign.work.PATIENCE", 0.0)
+    monkeypatch.setattr("robins.campaign.work.CLAIM_CHUNKS", 0.0)
     *_, last = campaign_work(tmp_path)
     assert last == (14, 14)
     assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
@@ -301,7 +301,7 @@ def test_a_second_coordinator_waits_for_the_report_of_the_first(tmp_path, monkey
     asked = []
 
     def publish(outcome, to, **options):
-        asked.append((to, options["patience_s"]))
+        asked.append((to, options["timeout_s"]))
         return SimpleNamespace(path=tmp_path, report="")
 
     monkeypatch.setattr(workbench, "publish", publish)

@@ -104,15 +104,15 @@ def test_a_long_campaign_goes_over_to_compiled_lanes_with_the_same_bits(problem,
     monkeypatch.setattr(machines, "available_cores", lambda: 1)
     lanes = LaneMachine(problem)
     by, scans = lanes._hand_over, []
-    took = by.took
+    record = by.record_time
 
     def taken(*of):
-        took(*of)
+        record(*of)
         if by.compiling is not None:
             by.compiling.join()
         scans.append([loop.rounds.lanes for loop in by._loops])
 
-    monkeypatch.setattr(by, "took", taken)
+    monkeypatch.setattr(by, "record_time", taken)
     found = simulate(problem, 80, 8, machine=lanes)
     assert found.solution.identical(want.solution)
     assert found.machine == "vm"
@@ -124,7 +124,7 @@ def test_a_long_campaign_goes_over_to_compiled_lanes_with_the_same_bits(problem,
 def test_compiling_has_to_pay(problem):
     by = LaneMachine(problem)._hand_over
     for left in (10_000_000, 1, 0):  # the first may have traced, the others are too few
-        by.took(8, 1e-3, left)
+        by.record_time(8, 1e-3, left)
     assert by.compiling is None
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from robins import linalg
 from robins.filters import Motion, Sensor, gamma_min, steady_h_infinity
-from robins.filters.analysis import anees, gramian, grand_mean_nis, whiteness, worded
+from robins.filters.analysis import anees, direction_in_words, gramian, grand_mean_nis, whiteness
 from robins.filters.synthesis import closed_form, h2_norm, hinf_norm, plant
 
 EYE = np.eye(2)
@@ -56,8 +56,14 @@ WRONG = {
     ),
     "Gramian of NaN": (lambda: gramian(np.full((2, 2), np.nan)), r"L\[0, 0\] is nan"),
     "Gramian of a rectangle": (lambda: gramian(np.ones((2, 3))), r"L is \(2, 3\), must be"),
-    "no direction": (lambda: worded(np.zeros(2), "ab"), "the length of the vector is, got 0"),
-    "direction without names": (lambda: worded(np.ones(3), "ab"), "for each of 2 names"),
+    "no direction": (
+        lambda: direction_in_words(np.zeros(2), "ab"),
+        "the length of the vector is, got 0",
+    ),
+    "direction without names": (
+        lambda: direction_in_words(np.ones(3), "ab"),
+        "for each of 2 names",
+    ),
     "norm of huge numbers": (lambda: hinf_norm(EYE / 2, 1e200 * EYE, EYE), "B holds 1e[+]200"),
     "H2 norm of huge numbers": (lambda: h2_norm(EYE / 2, EYE, 1e200 * EYE), "C holds 1e[+]200"),
     "no end of a search": (

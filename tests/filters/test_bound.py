@@ -12,11 +12,11 @@ from robins.filters.analysis.bound import covariance_bound, used_sensors
 from robins.filters.analysis.observability import (
     NOTHING,
     bits,
+    direction_in_words,
     gramian,
     observability,
     spectrum,
     unobservable,
-    worded,
 )
 
 T = 20
@@ -230,7 +230,7 @@ def test_what_no_sensor_tells_apart_is_named():
     assert np.sum(values >= NOTHING) == 2
     basis = unobservable(values, vectors)
     # 3 a + 4 b = 0 of what is measured in units of the prior: a = 0.8, b = -0.6
-    assert sorted(worded(v, names) for v in basis.T) == [
+    assert sorted(direction_in_words(v, names) for v in basis.T) == [
         "100 % clock",
         "64 % range against 36 % bias",
     ]

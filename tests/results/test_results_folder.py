@@ -339,10 +339,10 @@ def test_a_writer_with_patience_waits_for_the_other(earlier):
     first = ResultWriter(earlier)
     first.save_summary(a_summary(seed=2))
     with pytest.raises(ResultError, match="is being written by process"):
-        ResultWriter(earlier, patience_s=0.3)
+        ResultWriter(earlier, timeout_s=0.3)
     other = threading.Timer(0.5, first.commit)
     other.start()
-    with ResultWriter(earlier, patience_s=60.0) as second:
+    with ResultWriter(earlier, timeout_s=60.0) as second:
         assert read(earlier).summary["seed"] == 2
         second.save_summary(a_summary(seed=3))
     other.join()

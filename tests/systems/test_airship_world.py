@@ -106,7 +106,7 @@ def test_a_unit_without_errors_navigates_to_the_truth(perfect):
     # in pieces there is nothing but rounding; in one step an epoch, what a second's step leaves out
     for increments, every, metres, m_s in (
         (flat, pieces, 1e-4, 1e-5),
-        (world.whole, 1, 5e-3, 5e-4),
+        (world.epoch_increments, 1, 5e-3, 5e-4),
     ):
         path = mechanise(world.start, increments)
         ends = jax.tree.map(lambda x, every=every: x[every - 1 :: every], path)
@@ -137,7 +137,9 @@ def test_wind_changes_nothing_of_what_the_sensors_get_wrong(windy):
 def specific_force(batch):
     """Velocity gained by what the accelerometers felt in each epoch, NED without gravity (runs)."""
     before = jnp.concatenate([batch.start.q_nb.wxyz[:, None], batch.truth.q_nb.wxyz[:, :-1]], 1)
-    felt = jax.vmap(jax.vmap(lambda q, dv: Rotation(q).apply(dv)))(before, batch.whole.dv)
+    felt = jax.vmap(jax.vmap(lambda q, dv: Rotation(q).apply(dv)))(
+        before, batch.epoch_increments.dv
+    )
     v = np.concatenate([batch.start.v_n[:, None], batch.truth.v_n], 1)
     return np.asarray(felt)[..., :2], np.diff(v, axis=1)[..., :2]
 

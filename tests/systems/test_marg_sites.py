@@ -14,15 +14,15 @@ DOWN = np.array([0.0, 0.0, -9.81])
 HOME, OTHER = np.array([18e-6, 0.0, 44e-6]), np.array([17e-6, 4e-6, 47e-6])
 
 
-def visits(*rests, at_home=True, apart_s=10.0, count=4):
+def visits(*rests, starts_at_rest=True, apart_s=10.0, count=4):
     """Sites read at rests of 3 s: of each its field in body axes, or the field and the force."""
     sites, out = Sites(count), []
     for rest in rests:
         field, force = rest if isinstance(rest, tuple) else (rest, DOWN)
-        looks = [sites.look(BLOCK_S, True, at_home, force, field) for _ in range(30)]
+        looks = [sites.look(BLOCK_S, True, starts_at_rest, force, field) for _ in range(30)]
         out.append([look for look in looks if look is not NONE])
         for _ in range(round(apart_s / BLOCK_S)):
-            assert sites.look(BLOCK_S, False, at_home, DOWN, field) is NONE
+            assert sites.look(BLOCK_S, False, starts_at_rest, DOWN, field) is NONE
     return out
 
 
@@ -46,7 +46,7 @@ def test_a_field_as_strong_with_another_dip_is_another_site():
 
 
 def test_a_log_that_begins_in_motion_has_no_first_site():
-    found = visits(HOME, HOME, at_home=False)
+    found = visits(HOME, HOME, starts_at_rest=False)
     assert [[site for site, *_ in one] for one in found] == [[1], [1]]
 
 

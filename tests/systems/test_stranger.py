@@ -244,9 +244,9 @@ def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
 def test_a_bank_and_a_model_made_again_have_the_same_structure():
     parameters = InsGnssReplay()
 
-    def made(patience_s):
+    def made(fault_s):
         own = ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
-        bank = robust(own, 0.25, patience_s)
+        bank = robust(own, 0.25, fault_s)
         return [
             jax.tree_util.tree_flatten(x)
             for x in (bank, hypothesis_model(own, AS_TOLD), fresh(own))

@@ -20,10 +20,10 @@ from robins.filters.analysis.bound import bound_along, linearised, used_sensors
 from robins.filters.analysis.observability import (
     NOTHING,
     bits,
+    direction_in_words,
     observability_along,
     spectrum,
     unobservable,
-    worded,
 )
 from robins.filters.model import Data
 from robins.manifold import State, dim, is_element
@@ -248,7 +248,7 @@ def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarra
     rest = vectors[:, hidden.shape[1] :]
     most = min(max(_FEWEST, int(np.sum(values < FEW))), _MOST)
     shown = (sign[open_, None] * np.concatenate([hidden, rest], axis=1))[:, :most]
-    words = [f"{i + 1}: {worded(v, labels)}" for i, v in enumerate(shown.T)]
+    words = [f"{i + 1}: {direction_in_words(v, labels)}" for i, v in enumerate(shown.T)]
     data: dict[str, Any] = {"state": ("state", labels), "direction": ("direction", words)}
     data |= array("information", bits(L[:, open_]).T)
     data |= array("gramian", values[: len(words)], nothing=NOTHING)

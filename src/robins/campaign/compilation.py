@@ -30,7 +30,7 @@ class CompilationTrigger:
         self._lock = threading.Lock()
         self.compiling: threading.Thread | None = None
 
-    def took(self, runs: int, seconds: float, left: int) -> None:
+    def record_time(self, runs: int, seconds: float, left: int) -> None:
         """Record the time of some runs, and compile the loops if that pays for the rest.
 
         The first call only starts the record, as it may have traced the loops.

@@ -288,7 +288,7 @@ class LaneMachine:
         begun, world = thread_time(), self._worlds(begin, width, count)
         found = {name: self._of(name, world, count, taken) for name in names}
         if self._hand_over is not None:
-            self._hand_over.took(width, thread_time() - begun, left)
+            self._hand_over.record_time(width, thread_time() - begun, left)
         return found
 
 

@@ -120,7 +120,7 @@ class ManyRuns:
         def chunk(begin: int) -> Tree:
             begun, count = thread_time(), min(width, runs - begin)
             found = staged(*given(np.arange(begin, begin + width).clip(max=runs - 1)))
-            self._hand_over.took(width, thread_time() - begun, runs - begin - count)
+            self._hand_over.record_time(width, thread_time() - begun, runs - begin - count)
             return jax.tree_util.tree_map(
                 lambda x: x[:count] if is_key(x.dtype) else np.asarray(x)[:count], found
             )

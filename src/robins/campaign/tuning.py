@@ -257,12 +257,12 @@ def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
     edge = [(-FARTHEST, FARTHEST)] * p
     if slopes.gradient:
 
-        def whole(x: np.ndarray) -> tuple[float, np.ndarray]:
+        def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, each = slopes.gradients(x)
             return (value, np.mean(each, axis=0)) if np.isfinite(value) else (_LOST, np.zeros(p))
 
         how = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-5}
-        solve = partial(optimize.minimize, whole, jac=True, method="L-BFGS-B")
+        solve = partial(optimize.minimize, objective, jac=True, method="L-BFGS-B")
     else:
 
         def total(x: np.ndarray) -> float:

@@ -27,7 +27,7 @@ from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 from robins.systems.study import Problem
 
-PATIENCE = 3.0  # times the duration of a chunk, for which claims of others are respected
+CLAIM_CHUNKS = 3.0  # times the duration of a chunk, for which claims of others are respected
 LEAST_S = 5.0  # at least, also before this worker has computed one
 POLL_S = 0.2
 
@@ -154,7 +154,7 @@ class Worker:
         now = monotonic()
         for one in lack:
             since = self._seen.setdefault(one.claim, now)
-            if now - since > max(PATIENCE * self._took, LEAST_S):
+            if now - since > max(CLAIM_CHUNKS * self._took, LEAST_S):
                 self._seen[one.claim] = now  # others in their turn
                 return one
         return None

@@ -174,7 +174,7 @@ def replay(record: Path, as_json: bool, **options: Any) -> int:
         click.echo(damage, err=as_json)
     print_data(found.data, found.text, as_json)
     asked = options["filter_"] is not None or options["diff"] is not None
-    return ExitStatus.DONE if (found.same or asked) and found.whole else ExitStatus.FAILED
+    return ExitStatus.DONE if (found.same or asked) and found.complete else ExitStatus.FAILED
 
 
 @bench.command(short_help="List the serial ports of this machine.")

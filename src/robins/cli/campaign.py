@@ -126,12 +126,12 @@ def _deliver(
     bench: ModuleType, where: str, outcome: Outcome, as_json: bool, to: Path | None = None
 ) -> None:
     # several coordinators of a campaign end at the same time, each with all runs to report
-    patience_s = 0.0 if to else _PATIENCE_S
+    timeout_s = 0.0 if to else _PATIENCE_S
     to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
     command, writing = command_line(), Progress("drawing figures")
 
     def write() -> Result:
-        return bench.publish(outcome, to, command=command, progress=writing, patience_s=patience_s)
+        return bench.publish(outcome, to, command=command, progress=writing, timeout_s=timeout_s)
 
     print_and_write(outcome, write, writing, as_json)
 

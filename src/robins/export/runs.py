@@ -127,14 +127,14 @@ def reset_function(filter_: Filter, start: FilterState) -> EntryFunction:
     belief that is not finite is refused.
     """
 
-    def begin_anew(state: FilterState, belief: Belief):
+    def reset(state: FilterState, belief: Belief):
         given = belief._replace(factor=jnp.tril(belief.factor))
-        whole = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(given)])
-        taken = jnp.all(whole)
+        are_finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(given)])
+        taken = jnp.all(are_finite)
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
         return select(taken, filter_.reset(start, given), state), PredictionResult(code)
 
-    return begin_anew
+    return reset
 
 
 Calls = dict[str, tuple[State, State]]  # of each entry point what it returns, state and result

@@ -117,8 +117,8 @@ def _present(predicted: State, measured: State) -> Array:
     if not manifold.is_element(predicted):
         return jnp.isfinite(jnp.reshape(measured, -1))
     # An element has fewer tangent components than numbers: test the tangent vector.
-    whole = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(measured)]))
-    return jnp.isfinite(jnp.reshape(predicted.local(measured), -1)) | whole
+    is_finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(measured)]))
+    return jnp.isfinite(jnp.reshape(predicted.local(measured), -1)) | is_finite
 
 
 def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:

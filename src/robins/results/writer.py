@@ -36,7 +36,7 @@ class ResultWriter:
         scenario_text: the scenario as it was read, with the changes of the command line.
         device: that computed it, e.g. "cpu" or the name of an accelerator.
         command: the command line or call that reproduces the result.
-        patience_s: time to wait for another writer of the folder before it is refused.
+        timeout_s: time to wait for another writer of the folder before it is refused.
 
     Raises:
         ResultError: the path cannot or must not be written to; also from every method.
@@ -49,7 +49,7 @@ class ResultWriter:
         scenario_text: str = "",
         device: str = "cpu",
         command: str = "",
-        patience_s: float = 0.0,
+        timeout_s: float = 0.0,
     ):
         self.path = Path(path)
         self.scenario_text, self.device, self.command = scenario_text, device, command
@@ -57,9 +57,9 @@ class ResultWriter:
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
         self._moved: list[Path] = []
-        if not patience_s:  # else another writer may be replacing it; `commit` checks
+        if not timeout_s:  # else another writer may be replacing it; `commit` checks
             _check_replaceable(self.path)
-        self._stage = _staged(self.path, patience_s)
+        self._stage = _staged(self.path, timeout_s)
 
     def save_solution(self, dataset: xr.Dataset) -> None:
         """Store the time series as `solution.nc`; `robins.results` lists what it holds.
@@ -174,13 +174,13 @@ class ResultWriter:
             self.discard()  # nothing is left to do after a commit
 
 
-def _staged(path: Path, patience_s: float) -> folder.StagedFolder:
+def _staged(path: Path, timeout_s: float) -> folder.StagedFolder:
     """Stage a result once no other writer holds its folder.
 
     Raises:
         ResultError: another writer still holds it after that time, or it cannot be made.
     """
-    until = monotonic() + patience_s
+    until = monotonic() + timeout_s
     while True:
         try:
             return folder.stage(path)

@@ -27,7 +27,7 @@ from robins.sim.trajectory import (
     from_velocity,
     knots_of,
     quaternion,
-    smooth,
+    smoothstep,
 )
 
 _EASE = 0.3  # share of a ramp in which its rate rises, and in which it falls
@@ -161,7 +161,7 @@ def _ramp(u, ease):
     fallen = area(fall) + np.maximum(u - 1.0, 0.0)
     top = 1.0 / (1.0 - ease)
     # Rounding must not overshoot: a speed of -1e-15 m/s would reverse the heading.
-    return np.clip(top * (risen - fallen), 0.0, 1.0), top * (smooth(rise) - smooth(fall))
+    return np.clip(top * (risen - fallen), 0.0, 1.0), top * (smoothstep(rise) - smoothstep(fall))
 
 
 def _wave(t, duration, period):
@@ -169,7 +169,7 @@ def _wave(t, duration, period):
     ease = min(period, 0.5 * duration)
     s = np.clip(np.minimum(t, duration - t) / ease, 0.0, 1.0)
     side = np.where(t < 0.5 * duration, 1.0, -1.0) / ease
-    window, slope = smooth(s), 30.0 * s**2 * (1.0 - s) ** 2 * side
+    window, slope = smoothstep(s), 30.0 * s**2 * (1.0 - s) ** 2 * side
     phase = 2.0 * np.pi * t / period
     sine, cosine = np.sin(phase), np.cos(phase)
     return window * sine, slope * sine + 2.0 * np.pi / period * window * cosine

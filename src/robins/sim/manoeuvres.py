@@ -19,7 +19,14 @@ from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.earth import Geodetic, gravity
 from robins.errors import require
-from robins.sim.trajectory import MotionProfile, along, from_velocity, knots_of, quaternion, smooth
+from robins.sim.trajectory import (
+    MotionProfile,
+    along,
+    from_velocity,
+    knots_of,
+    quaternion,
+    smoothstep,
+)
 
 _STEEPEST_RAD = np.deg2rad(85.0)
 _KNOTS_A_PERIOD = 20
@@ -101,7 +108,7 @@ def fly(
     t = knots_of(float(sum(leg.duration_s for leg in banks)), knots_hz)
     bank, begin, before = np.zeros_like(t), 0.0, 0.0
     for leg in banks:
-        bank += (leg.bank_rad - before) * smooth(np.clip((t - begin) / roll_s, 0.0, 1.0))
+        bank += (leg.bank_rad - before) * smoothstep(np.clip((t - begin) / roll_s, 0.0, 1.0))
         begin, before = begin + leg.duration_s, leg.bank_rad
     g = float(np.asarray(gravity(start.lat, start.alt)))
     turn = make_interp_spline(t, g * np.tan(bank) / speed_mps, k=5).antiderivative()

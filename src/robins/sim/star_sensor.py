@@ -273,7 +273,7 @@ def expose(key: Array, shown: StarField, camera: StarCamera) -> StarImage:
     fainter = jnp.maximum(magnitude - camera.sigma_magnitude, 0.0)
     sigma = camera.sigma_rad * 10.0 ** (camera.sigma_growth * fainter)
     noise = sigma[:, None] * normal[:, :2]
-    vectors_s = _shifted(jnp.concatenate([shown.vectors_s, false_s]), noise)
+    vectors_s = _deflected(jnp.concatenate([shown.vectors_s, false_s]), noise)
     reported = magnitude + camera.magnitude_sigma * normal[:, 2]
 
     order = jnp.argsort(jnp.where(there, reported, jnp.inf))
@@ -338,7 +338,7 @@ def solve(
     return found.q_ib, found.covariance, found.stars
 
 
-def _shifted(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+def _deflected(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
     """Unit vectors near z, rotated by two small angles [rad] across the line of sight."""
     first = jnp.stack([unit[:, 2], jnp.zeros(len(unit)), -unit[:, 0]], 1)
     first = first / jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))

@@ -259,7 +259,7 @@ def knots_of(duration_s: float, knots_hz: float) -> np.ndarray:
     return np.linspace(0.0, duration_s, max(int(np.ceil(duration_s * knots_hz)), 8) + 1)
 
 
-def smooth(s: np.ndarray) -> np.ndarray:
+def smoothstep(s: np.ndarray) -> np.ndarray:
     """Rise from 0 to 1 over s in [0, 1] with two continuous derivatives."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 

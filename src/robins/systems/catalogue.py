@@ -75,7 +75,7 @@ def listed(system: str) -> dict[str, ListedScenario]:
     return dict(sorted(found.items(), key=lambda item: studies.index(item[1].study)))
 
 
-def configurations(system: str) -> dict[str, Path]:
+def replay_files(system: str) -> dict[str, Path]:
     """Packaged configurations of replays of a system, by name."""
     return {path.stem: path for path in _files(system) if path.stem not in listed(system)}
 

@@ -80,7 +80,7 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
         time_s: (E,).
         wrong: its probabilities; NaN between the pieces of a log.
     """
-    worded = []
+    sentences = []
     for suspect, chance in wrong.items():
         chance = np.asarray(chance, float)
         held = [(a, b) for a, b in edges(chance > HELD) if not _as_begun(chance, a, b)]
@@ -91,10 +91,10 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
             longest = sorted(sorted(found, key=lambda one: one[0] - one[1])[:_SHOWN])
             shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest)
             more = f" and {len(found) - _SHOWN} shorter times" if len(found) > _SHOWN else ""
-            worded.append(f"{name} {verb}: {shown}{more}; probability up to {most:.2f}.")
-    if wrong and not worded:
+            sentences.append(f"{name} {verb}: {shown}{more}; probability up to {most:.2f}.")
+    if wrong and not sentences:
         return [f"{name} finds nothing wrong with {', '.join(map(words, wrong))}."]
-    return worded
+    return sentences
 
 
 def _as_begun(chance: np.ndarray, begin: int, end: int) -> bool:

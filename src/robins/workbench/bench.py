@@ -139,7 +139,7 @@ class ReplayComparison(NamedTuple):
     frames: int  # number that it sent the second time
     same: bool  # byte for byte
     differences: list[FieldDifference]
-    whole: bool  # neither record was cut or damaged
+    complete: bool  # neither record was cut or damaged
     damages: list[str]  # why not, a sentence a record
     until_s: float  # end of what was compared
     planned_s: float  # planned end of the run
@@ -151,14 +151,14 @@ class ReplayComparison(NamedTuple):
         """The comparison in the types of JSON."""
         rows = [vars(difference) for difference in self.differences]
         said = {"node": self.node, "frames": self.frames, "same": self.same, "differences": rows}
-        said |= {"whole": self.whole, "until_s": self.until_s, "planned_s": self.planned_s}
+        said |= {"whole": self.complete, "until_s": self.until_s, "planned_s": self.planned_s}
         return plain(said)
 
     @property
     def text(self) -> str:
         """The comparison for people."""
         lines, so_far = [], ""
-        if not self.whole:
+        if not self.complete:
             span = f"up to {self.until_s:g} s of a run of {self.planned_s:g} s"
             lines.append(f"Compared, and no more: {self.compared} frames, {span}.")
             so_far = "as far as the record goes, "
@@ -220,13 +220,13 @@ def bench_replay(
     found = frames.found()
     same = not found if second is not None else first_difference is None
     both = ((record, first), (diff, second))
-    damages = [f"{path} is not whole: {one.why}" for path, one in both if one and not one.whole]
+    damages = [f"{path} is not whole: {one.why}" for path, one in both if one and not one.complete]
     return ReplayComparison(
         node=node,
         frames=frames.frames[1],
         same=same,
         differences=found,
-        whole=not damages,
+        complete=not damages,
         damages=damages,
         until_s=min(frames.until_ns) * 1e-9,
         planned_s=int(first.header["steps"]) * step_ns * 1e-9,

@@ -39,19 +39,19 @@ class ExportTrack(NamedTuple):
     utc: np.ndarray | None  # (E,) datetime64[ns]; None where no date is known
 
     @property
-    def whole(self) -> np.ndarray:
+    def complete(self) -> np.ndarray:
         """(E,) which places have all three coordinates."""
         return np.isfinite(self.lat_rad + self.lon_rad + self.alt_m)
 
     @property
     def first(self) -> tuple[float, float, float]:
-        """The first whole place: rad, rad, m."""
-        row = np.argmax(self.whole)
+        """First complete position: latitude [rad], longitude [rad], height [m]."""
+        row = np.argmax(self.complete)
         return float(self.lat_rad[row]), float(self.lon_rad[row]), float(self.alt_m[row])
 
     def pieces(self) -> Iterator[tuple[list[tuple[str, str, str]], list[str] | None]]:
         """Latitude and longitude [deg] and height [m] of each piece, as text, and dates."""
-        edges = np.flatnonzero(np.diff(self.whole, prepend=False, append=False))
+        edges = np.flatnonzero(np.diff(self.complete, prepend=False, append=False))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             rows = slice(begin, end)
             angles = (np.degrees(a[rows]) for a in (self.lat_rad, self.lon_rad))
@@ -87,7 +87,7 @@ def tracks(solution: xr.Dataset) -> list[ExportTrack]:
         names = _filters(solution) if "filter" in lat.dims else [name]
         rows = zip(names, *(np.atleast_2d(x.values) for x in (lat, lon, alt)), strict=True)
         found += [ExportTrack(one, text, clock, a, o, h, date) for one, a, o, h in rows]
-    return [track for track in found if np.any(track.whole)]
+    return [track for track in found if np.any(track.complete)]
 
 
 def export(solution: xr.Dataset, formats: Sequence[str], name: str = "robins") -> dict[str, bytes]:

@@ -12,7 +12,7 @@ import jax
 from robins import scenario, systems
 from robins.errors import hint, require_known
 from robins.systems import Study, System
-from robins.systems.catalogue import configurations, installed, is_file, listed
+from robins.systems.catalogue import installed, is_file, listed, replay_files
 from robins.systems.finding import find_system
 from robins.systems.study import Problem
 from robins.workbench.errors import InputError, refusing
@@ -45,7 +45,7 @@ def find_scenario(
         )
     known = systems.SYSTEMS
     packaged = {f"{s}/{k}": (s, one.path) for s in known for k, one in listed(s).items()}
-    others = {f"{s}/{k}": (s, path) for s in known for k, path in configurations(s).items()}
+    others = {f"{s}/{k}": (s, path) for s in known for k, path in replay_files(s).items()}
     if recorded:
         packaged |= others
     elif name in others:

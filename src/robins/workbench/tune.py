@@ -32,12 +32,12 @@ from robins.workbench.tune_objectives import (
     FIRST_BLOCK,
     INNOVATIONS,
     TuningRequest,
+    objective_in_words,
     on_log,
     on_runs,
     overridden,
     settings_at,
     total_of,
-    worded,
 )
 
 _COLUMNS = ("parameter", "as written", "factor", "low", "high", "now")  # of tuning.csv
@@ -169,7 +169,7 @@ def _outcome(of: TuningRequest, found: Tuned, seed: int) -> Outcome:
 
 def _change(of: TuningRequest, found: Tuned) -> str:
     """Change of the objective on the data held out, in words."""
-    if of.by == worded(INNOVATIONS):
+    if of.by == objective_in_words(INNOVATIONS):
         total = total_of(INNOVATIONS, ())
         was, now = (-total(m.mean(axis=0)) for m in (found.before, found.after))
         return (
@@ -199,7 +199,9 @@ def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, float]:
 def _solution(of: TuningRequest, found: Tuned, bands: np.ndarray) -> xr.Dataset:
     """Factors with their intervals, and the objective of each part that was held out."""
     total = of.objective.total
-    label = "minus log density" if of.by == worded(INNOVATIONS) else "ln of the RMS error"
+    label = (
+        "minus log density" if of.by == objective_in_words(INNOVATIONS) else "ln of the RMS error"
+    )
     data: dict[str, Any] = {"parameter": ("parameter", [v.key for v in of.vary])}
     for name, values in zip(("factor", "low", "high"), bands.T, strict=True):
         data |= array(f"tuned_{name}", values)

@@ -96,7 +96,7 @@ def total_of(by: str, names: Sequence[str]) -> Callable[[np.ndarray], float]:
     return lambda mean: 0.5 * float(np.mean(np.log(mean[FIRST_BLOCK:][which])))
 
 
-def worded(by: str) -> str:
+def objective_in_words(by: str) -> str:
     """Objective in words."""
     if by == INNOVATIONS:
         return "log density of a measured component"
@@ -157,7 +157,7 @@ def on_runs(
         judged_on=Data(jax.tree_util.tree_map(lambda x: x[0, runs:], worlds)),
         parts="runs",
         blocks=problem.blocks,
-        by=worded(by),
+        by=objective_in_words(by),
         text=read.text,
         settings=settings,
         label=read.label,
@@ -256,7 +256,7 @@ def on_log(
         judged_on=Data(np.zeros(1), np.flatnonzero(held)),
         parts="segments",
         blocks=(),
-        by=worded(INNOVATIONS),
+        by=objective_in_words(INNOVATIONS),
         text=opened.text,
         settings=settings,
         label=label,

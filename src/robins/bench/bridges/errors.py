@@ -72,7 +72,7 @@ def vector(name: str, values: Sequence[float] | np.ndarray, message: str, size: 
     return [finite(name, value, message) for value in values]
 
 
-def whole(name: str, value: float | int, low: int, high: int, message: str) -> int:
+def as_integer(name: str, value: float | int, low: int, high: int, message: str) -> int:
     """Round to a whole number for a field that holds `low` to `high`.
 
     Raises:

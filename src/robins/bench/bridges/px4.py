@@ -175,8 +175,8 @@ class Px4Simulator(Closing):
         self.send(sample)
         start, other = time.monotonic(), ""
         while True:
-            patience = FREEWHEEL_S if self.freewheeling else timeout_s
-            answer = self.actuators(start + patience - time.monotonic())
+            limit_s = FREEWHEEL_S if self.freewheeling else timeout_s
+            answer = self.actuators(start + limit_s - time.monotonic())
             if answer is None:
                 break
             if not answer.lockstep:

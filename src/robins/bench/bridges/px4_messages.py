@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robins.bench.bridges.errors import BridgeError, finite, needed, vector, whole
+from robins.bench.bridges.errors import BridgeError, as_integer, finite, needed, vector
 from robins.earth.atmosphere import pressure_altitude_m
 
 Vector = Sequence[float] | np.ndarray
@@ -195,20 +195,20 @@ def _hil_gps(s: GnssFix) -> Any:
     course = round(100.0 * course_deg) % 36000 if speed > 0.0 else UNKNOWN
     return dialect().MAVLink_hil_gps_message(
         _time(s, name),
-        whole("kind", s.kind, 0, 255, name),
+        as_integer("kind", s.kind, 0, 255, name),
         *_position(s, name),
-        whole("horizontal_m [cm]", 100.0 * s.horizontal_m, 0, UNKNOWN - 1, name),
-        whole("vertical_m [cm]", 100.0 * s.vertical_m, 0, UNKNOWN - 1, name),
-        whole("ground speed [cm/s]", 100.0 * speed, 0, UNKNOWN - 1, name),
+        as_integer("horizontal_m [cm]", 100.0 * s.horizontal_m, 0, UNKNOWN - 1, name),
+        as_integer("vertical_m [cm]", 100.0 * s.vertical_m, 0, UNKNOWN - 1, name),
+        as_integer("ground speed [cm/s]", 100.0 * speed, 0, UNKNOWN - 1, name),
         *_velocity(v_n, name),
         course,
-        whole("satellites", s.satellites, 0, 254, name),
+        as_integer("satellites", s.satellites, 0, 254, name),
     )
 
 
 def _hil_state(s: Truth) -> Any:
     name = "HIL_STATE_QUATERNION"
-    airspeed = whole("airspeed_m_s [cm/s]", 100.0 * s.airspeed_m_s, *UINT16, name)
+    airspeed = as_integer("airspeed_m_s [cm/s]", 100.0 * s.airspeed_m_s, *UINT16, name)
     milli_g = [1e3 / GRAVITY_M_S2 * f for f in vector("f_b_m_s2", s.f_b_m_s2, name)]
     return dialect().MAVLink_hil_state_quaternion_message(
         _time(s, name),
@@ -218,23 +218,25 @@ def _hil_state(s: Truth) -> Any:
         *_velocity(vector("v_n_m_s", s.v_n_m_s, name), name),
         airspeed,
         airspeed,
-        *(whole("f_b_m_s2 [mG]", f, *INT16, name) for f in milli_g),
+        *(as_integer("f_b_m_s2 [mG]", f, *INT16, name) for f in milli_g),
     )
 
 
 def _time(s: Px4Sample, name: str) -> int:
-    return whole("time_us", s.time_us, 0, 2**64 - 1, name)
+    return as_integer("time_us", s.time_us, 0, 2**64 - 1, name)
 
 
 def _position(s: GnssFix | Truth, name: str) -> tuple[int, int, int]:
     return (
-        whole("lat_rad [degE7]", 1e7 * math.degrees(s.lat_rad), -900_000_000, 900_000_000, name),
-        whole(
+        as_integer(
+            "lat_rad [degE7]", 1e7 * math.degrees(s.lat_rad), -900_000_000, 900_000_000, name
+        ),
+        as_integer(
             "lon_rad [degE7]", 1e7 * math.degrees(s.lon_rad), -1_800_000_000, 1_800_000_000, name
         ),
-        whole("alt_m [mm]", 1e3 * s.alt_m, *INT32, name),
+        as_integer("alt_m [mm]", 1e3 * s.alt_m, *INT32, name),
     )
 
 
 def _velocity(v_n: list[float], name: str) -> list[int]:
-    return [whole("v_n_m_s [cm/s]", 100.0 * v, *INT16, name) for v in v_n]
+    return [as_integer("v_n_m_s [cm/s]", 100.0 * v, *INT16, name) for v in v_n]

@@ -177,12 +177,6 @@ class Ros2Topics(Closing):
             attached = attachment(self._sequence, time.time_ns(), self._gid)
         self._publishers[key].put(data, attachment=attached)
 
-    def has_subscriber(self, topic: str) -> bool:
-        """True if a topic, on which we have published, has a subscriber."""
-        kind = self._kinds.get(topic)
-        publisher = None if kind is None else self._publishers.get(self._key(topic, kind))
-        return publisher is not None and publisher.matching_status.matching
-
     def subscribe(self, topic: str, kind: type[Message]) -> None:
         """Subscribe to a topic; its last 100 samples wait to be taken.
 

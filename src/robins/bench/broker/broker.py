@@ -104,12 +104,12 @@ class Broker:
 
     # ------------------------------------------------------------------------------- beginning
 
-    def gather(self, run: int, patience_s: float) -> None:
+    def gather(self, run: int, timeout_s: float) -> None:
         """Wait until every part has sent its hello, and start the run.
 
         Args:
             run: its number.
-            patience_s: time-out for a part without a process, or whose process is idle.
+            timeout_s: time-out for a part without a process, or whose process is idle.
 
         Raises:
             BenchError: a part sends nothing, or uses another version of the wire.
@@ -118,19 +118,19 @@ class Broker:
         for link in self.links.values():
             link.restart(run)
             link.greeted = False
-        self._await(self.links, patience_s)
+        self._await(self.links, timeout_s)
 
-    def _await(self, parts: Iterable[str], patience_s: float) -> None:
+    def _await(self, parts: Iterable[str], timeout_s: float) -> None:
         began, shown, shown_s = time.monotonic(), list[str](), 0.0
         while waited := [name for name in parts if not self.links[name].greeted]:
             since_s = time.monotonic() - began
             if waited != shown or since_s - shown_s > _REPORT_S:
                 shown, shown_s = waited, since_s
                 self._waiting(waited, since_s)
-            idle = [name for name in waited if self._idle_s(name) > patience_s]
-            if since_s > patience_s and idle:
+            idle = [name for name in waited if self._idle_s(name) > timeout_s]
+            if since_s > timeout_s and idle:
                 raise BenchError(
-                    f"no hello from {', '.join(idle)} in {patience_s:g} s: is it connected, "
+                    f"no hello from {', '.join(idle)} in {timeout_s:g} s: is it connected, "
                     "at this speed, and does it run? (`robins bench ports` lists the ports)"
                 )
             self.poll(_POLL_S)
@@ -156,7 +156,7 @@ class Broker:
     def step(
         self,
         number: int,
-        patience_ns: int | None = None,
+        timeout_ns: int | None = None,
         again_ns: int = REPEAT_TICK_NS,
         most_ns: int = ANSWER_NS,
     ) -> None:
@@ -164,7 +164,7 @@ class Broker:
 
         Args:
             number: of the step, from 0.
-            patience_ns: time-out after which the step goes on without a part; None: ``most_ns``
+            timeout_ns: time-out after which the step goes on without a part; None: ``most_ns``
                 applies.
             again_ns: time after which an unanswered tick is sent again.
             most_ns: time after which a part that does not answer fails the run, unless its
@@ -187,17 +187,17 @@ class Broker:
             self._take(name, link.held(self.time_ns))
         self._advance()
         while len(self._done) < len(self.links):
-            self.poll(_POLL_S if patience_ns is None else min(_POLL_S, patience_ns * 1e-9))
-            self._wait(patience_ns, again_ns, most_ns)
+            self.poll(_POLL_S if timeout_ns is None else min(_POLL_S, timeout_ns * 1e-9))
+            self._wait(timeout_ns, again_ns, most_ns)
 
-    def _wait(self, patience_ns: int | None, again_ns: int, most_ns: int) -> None:
+    def _wait(self, timeout_ns: int | None, again_ns: int, most_ns: int) -> None:
         """Repeat the tick of parts that have not answered, or give them up."""
         now = _CLOCK_NS()
         for name, (at_ns, last_ns) in list(self._ticked.items()):
             if name in self._done:
                 continue
             waited = now - at_ns
-            if patience_ns is not None and waited > patience_ns:
+            if timeout_ns is not None and waited > timeout_ns:
                 self.silent[name] += 1
                 self._end(name)
             elif waited > again_ns and min(waited, 1e9 * self._idle_s(name)) > most_ns:
@@ -244,12 +244,12 @@ class Broker:
             if taker not in self.off:
                 self._put(self.links[taker], message, payload, self.time_ns)
 
-    def revive(self, name: str, patience_s: float, poll_processes: Callable[[], None]) -> None:
+    def revive(self, name: str, timeout_s: float, poll_processes: Callable[[], None]) -> None:
         """Bring a restarted part to the state of the old one; the run waits.
 
         Args:
             name: of the part.
-            patience_s: for its hello, and for each answer.
+            timeout_s: for its hello, and for each answer.
             poll_processes: called now and then.
 
         Raises:
@@ -261,7 +261,7 @@ class Broker:
         sent_frames = self._kept[name].sent_frames
         try:
             catch_up(
-                self.links[name], sent_frames, begin, answered, patience_s, poll_processes, idle_s
+                self.links[name], sent_frames, begin, answered, timeout_s, poll_processes, idle_s
             )
         except OSError as error:
             raise LinkLost(name, error) from None
@@ -277,14 +277,14 @@ class Broker:
         if name in self._kept:
             self._kept[name].forget()
 
-    def switch_on(self, name: str, patience_s: float) -> None:
+    def switch_on(self, name: str, timeout_s: float) -> None:
         """Include a restarted part again; the run waits for its hello.
 
         Raises:
             BenchError: no hello comes.
             LinkLost: the far end of a port is gone.
         """
-        self._await([name], patience_s)
+        self._await([name], timeout_s)
         self.off.remove(name)
 
     # ----------------------------------------------------------------------------------- the wire

@@ -63,7 +63,7 @@ def catch_up(
     sent_frames: Sequence[SentFrame],
     begin: bytes,
     answered: int,
-    patience_s: float,
+    timeout_s: float,
     poll_processes: Callable[[], None],
     idle_s: Callable[[], float] = lambda: math.inf,
 ) -> None:
@@ -75,7 +75,7 @@ def catch_up(
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.
-        patience_s: time-out for its hello, and for each answer.
+        timeout_s: time-out for its hello, and for each answer.
         poll_processes: called now and then.
         idle_s: idle time of its process [s]; a process that computes has no time-out.
 
@@ -94,11 +94,11 @@ def catch_up(
                     step is None or BARE.decode(name, frame.payload)["step"] == step
                 ):
                     return
-            if min(time.monotonic() - began, idle_s()) > patience_s:
+            if min(time.monotonic() - began, idle_s()) > timeout_s:
                 what = name if step is None else f"answer to the tick of step {step}"
                 raise BenchError(
                     f"'{link.name}' was restarted, but there is no {what} from it in "
-                    f"{patience_s:g} s"
+                    f"{timeout_s:g} s"
                 )
             poll_processes()
             if select.select([link.fd], [], [], 0.05)[0]:

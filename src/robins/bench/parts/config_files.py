@@ -71,7 +71,7 @@ def put(config: Any, path: Path) -> None:
         OSError: it cannot be written.
     """
     arrays: list[pickle.PickleBuffer] = []
-    whole = pickle.dumps(config, protocol=5, buffer_callback=arrays.append)
+    pickled = pickle.dumps(config, protocol=5, buffer_callback=arrays.append)
     places: list[tuple[int, int]] = []
     with path.open("wb") as file:
         for array in arrays:
@@ -80,7 +80,7 @@ def put(config: Any, path: Path) -> None:
             file.write(array.raw())
             places.append((begin, file.tell()))
         at = file.tell()
-        file.write(pickle.dumps((places, whole)) + _END.pack(at))
+        file.write(pickle.dumps((places, pickled)) + _END.pack(at))
 
 
 def take(path: Path) -> Any:
@@ -92,5 +92,5 @@ def take(path: Path) -> Any:
     with path.open("rb") as file:
         held = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     (at,) = _END.unpack(held[-_END.size :])
-    places, whole = pickle.loads(held[at : -_END.size])
-    return pickle.loads(whole, buffers=[held[begin:end] for begin, end in places])
+    places, pickled = pickle.loads(held[at : -_END.size])
+    return pickle.loads(pickled, buffers=[held[begin:end] for begin, end in places])

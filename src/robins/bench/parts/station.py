@@ -197,8 +197,8 @@ class Station:
         self._inbox = {k: v for k, v in self._inbox.items() if k[1] > oldest}
         self._state, sent = self.part.act(self._state, step, inputs)
         answer = [(name, self._wire.encode(name, values)) for name, values in sent]
-        took = min(time.perf_counter_ns() - began, 2**32 - 1)
-        answer.append(("done", self._wire.encode("done", {"step": step, "compute": took})))
+        elapsed_ns = min(time.perf_counter_ns() - began, 2**32 - 1)
+        answer.append(("done", self._wire.encode("done", {"step": step, "compute": elapsed_ns})))
         self._done = step, time_ns, answer
 
     def _input(self, name: str, time_ns: int) -> Values | None:
@@ -230,8 +230,8 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
             that fails for lack of one is compiled by its first steps.
     """
     given = {name: part.example.get(name) for name in part.takes}
-    whole = contextlib.nullcontext() if given.keys() <= part.example.keys() else None
-    with whole or contextlib.suppress(Exception):
+    reraised = contextlib.nullcontext() if given.keys() <= part.example.keys() else None
+    with reraised or contextlib.suppress(Exception):
         for step in steps:
             part.act(part.begin(), step, given)
     part.rare()

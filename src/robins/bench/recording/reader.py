@@ -34,7 +34,7 @@ class Record(NamedTuple):
     header: dict[str, Any]
     entries: Sequence[layout.Entry] | Entries  # in the order in which they were written
     events: list[layout.Event]
-    whole: bool  # closed, and every checksum of the file holds
+    complete: bool  # closed, and every checksum of the file holds
     why: str  # reason why it is not whole; else empty
 
 

@@ -27,7 +27,7 @@ from robins.bench.wire.records import RecordError
 from robins.bench.wire.schema import BARE, FIRST_DATA, NUMBERS, Wire
 from robins.errors import RobinsError
 
-PATIENCE_S = 60.0  # time-out of a part that neither answers nor computes
+TIMEOUT_S = 60.0  # time-out of a part that neither answers nor computes
 _LOOK_S = 0.1  # period of checks that the part is alive
 _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
     NUMBERS[name] for name in ("hello", "tick", "done", "stop", "begin")
@@ -82,7 +82,7 @@ def replay(
     wire: Wire,
     part: str,
     start: Start,
-    patience_s: float = PATIENCE_S,
+    timeout_s: float = TIMEOUT_S,
     progress: Callable[[int, int], None] | None = None,
     says: Callable[[Frame], None] = lambda frame: None,
 ) -> Replayed:
@@ -97,7 +97,7 @@ def replay(
         wire: its messages.
         part: whose link it is.
         start: runs the part at a port.
-        patience_s: time-out for the part's hello, and for each step.
+        timeout_s: time-out for the part's hello, and for each step.
         progress: called with the steps done, and their total.
         says: called with each data frame that the part sends in the replay.
 
@@ -120,7 +120,7 @@ def replay(
         compared = compared or Differences(wire, step_ns)
         life = _PartLifetime(wire, begin, step_ns, compared, says)
         with open_pair() as pair, start(pair.path) as process:
-            _Replay(wire, part, pair, process, patience_s, life).run(rows, count)
+            _Replay(wire, part, pair, process, timeout_s, life).run(rows, count)
         first = first or life.first_difference()
         starts += 1
     assert compared is not None  # else there was no begin
@@ -198,7 +198,7 @@ class _Replay:
     _part: str
     _pair: Pair
     _process: Any
-    _patience_s: float
+    _timeout_s: float
     _life: _PartLifetime
     _idle_s: Callable[[int | None], float] = field(default_factory=idleness)
     _receiver: Receiver = field(default_factory=Receiver)
@@ -301,9 +301,9 @@ class _Replay:
         if poll is not None and (code := poll()) is not None and not self._read(0.0):
             raise ReplayError(f"part '{self._part}' died {self._where} (exit code {code})")
         idle_s = self._idle_s(getattr(self._process, "pid", None))
-        if min(time.monotonic() - began, idle_s) > self._patience_s:
+        if min(time.monotonic() - began, idle_s) > self._timeout_s:
             raise ReplayError(
-                f"part '{self._part}' did not answer {self._where} for {self._patience_s:g} s"
+                f"part '{self._part}' did not answer {self._where} for {self._timeout_s:g} s"
             )
 
 
@@ -378,9 +378,9 @@ class _PartLifetime:
         for number, frame in self._then.items():
             self._differs(number, f"{self._text(frame)} was recorded and is not said now")
         # a truncated record, or a part that died, ends in the middle of an answer
-        whole = self._tick <= self._answered
+        complete = self._tick <= self._answered
         for number, frame in self._now.items():
-            if whole or number < self._newest:
+            if complete or number < self._newest:
                 self._differs(number, f"{self._text(frame)} is said now and was not recorded")
         return None if self._first is None else self._first[1]
 

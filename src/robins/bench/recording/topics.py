@@ -199,9 +199,12 @@ def _schema(row: Topic, of: Message) -> Schema:
     if row.type != JSON:
         text = definition(TYPES[row.type])
         return Schema(0, text.encode(), SchemaEncoding.ROS2, row.type)
-    whole = {"type": "integer"}
+    integer = {"type": "integer"}
     fields: dict[str, Any] = {
-        "timestamp": {"type": "object", "properties": {"sec": whole, "nsec": whole}},
+        "timestamp": {
+            "type": "object",
+            "properties": {"sec": integer, "nsec": integer},
+        },
         "frame_id": {"type": "string"},
     }
     for f in of.fields:

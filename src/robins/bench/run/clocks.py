@@ -21,7 +21,7 @@ _SPIN_NS = 200_000  # before a deadline: busy wait instead of sleep
 class LockStep:
     """The next step begins when the last one is over."""
 
-    patience_ns: int | None = None
+    timeout_ns: int | None = None
 
     def wait(self, step: int, serve: Callable[[float], None]) -> int | None:
         """Return at once; there is no deadline."""
@@ -43,20 +43,20 @@ class RealTime:
     """Clock by which step k begins at t0 + k/rate (monotonic), whenever step k - 1 ended.
 
     Attributes:
-        patience_ns: time-out of a part in a step.
+        timeout_ns: time-out of a part in a step.
         skipped: number of deadlines skipped.
     """
 
-    def __init__(self, rate_hz: float, overrun: Overrun = "continue", patience: float = 1.0):
+    def __init__(self, rate_hz: float, overrun: Overrun = "continue", timeout_periods: float = 1.0):
         """Set the clock.
 
         Args:
             rate_hz: steps a second.
             overrun: what to do when a step is not over at the next one's deadline.
-            patience: periods for which a part is waited for.
+            timeout_periods: periods for which a part is waited for.
         """
         self._rate_hz, self._overrun = rate_hz, overrun
-        self.patience_ns: int | None = round(patience * 1e9 / rate_hz)
+        self.timeout_ns: int | None = round(timeout_periods * 1e9 / rate_hz)
         self.skipped = 0
         self._alarm_s = self._least_s = max(_BEHIND_S, _BEHIND_PERIODS / rate_hz)
         self._began_ns: int | None = None

@@ -197,7 +197,7 @@ class Session:
                     return k
                 deadline = self.clock.wait(k, self.broker.poll)
                 began = time.monotonic_ns()
-                self.broker.step(k, self.clock.patience_ns)
+                self.broker.step(k, self.clock.timeout_ns)
                 missed = self.clock.over(k)
                 ended = time.monotonic_ns()
                 self.latencies.cycle(k, deadline, began, ended, missed)
@@ -234,7 +234,7 @@ class Session:
             began = time.monotonic_ns()
             while True:
                 for command in self._watch.commands(self):
-                    self._do(command)
+                    self._carry_out(command)
                 if not self._paused or self._stop:
                     break
                 self.broker.poll(0.05)
@@ -242,7 +242,7 @@ class Session:
         if not self._stop:
             self._say(step)
 
-    def _do(self, command: JsonObject) -> None:
+    def _carry_out(self, command: JsonObject) -> None:
         what, label = command.get("do"), command.get("label")
         if what == "stop":
             self._stop = True

@@ -1,5 +1,6 @@
 """Accuracy of filters: consistency, covariance bound, observability, worst case."""
 
+from robins.errors import moved
 from robins.filters.analysis.bound import (
     Bound,
     bound_along,
@@ -18,12 +19,12 @@ from robins.filters.analysis.consistency import (
 )
 from robins.filters.analysis.observability import (
     bits,
+    direction_in_words,
     gramian,
     observability,
     observability_along,
     spectrum,
     unobservable,
-    worded,
 )
 from robins.filters.analysis.worst_case import (
     gamma_min,
@@ -39,6 +40,7 @@ __all__ = [
     "bits",
     "bound_along",
     "covariance_bound",
+    "direction_in_words",
     "gamma_min",
     "gramian",
     "grand_mean_nis",
@@ -54,6 +56,7 @@ __all__ = [
     "used_sensors",
     "whitened_innovations",
     "whiteness",
-    "worded",
     "worst_case_gain",
 ]
+
+__getattr__ = moved(__name__)

@@ -148,7 +148,7 @@ def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return basis / np.linalg.norm(basis, axis=0)
 
 
-def worded(vector: np.ndarray, names: Sequence[str]) -> str:
+def direction_in_words(vector: np.ndarray, names: Sequence[str]) -> str:
     """Composition of a direction in words, such as "82 % heading against 17 % gyro bias z".
 
     The shares are squares of the components, in units of the prior; "with" joins a state of the

@@ -279,7 +279,7 @@ class Federated(JoinedFilter):
                 member = f.reset(member, belief)
             else:
                 own = True
-                seen = _through(motion, common.belief, belief)
+                seen = _share_motion(motion, common.belief, belief)
                 member, prediction = f.predict(f.reset(member, state.belief), seen, u)
                 code = prediction.code
             members.append(member)
@@ -380,7 +380,7 @@ def _rescaled(members: Sequence[FilterState], keep: Numbers) -> list[Belief]:
     return [*kept, information_sum([master, *locals_], weights)]
 
 
-def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
+def _share_motion(motion: Motion, common: Belief, mine: Belief) -> Motion:
     """Motion that predicts, from the fused belief, a share of the common prediction.
 
     With S- the factor of the common prediction and S_i that of the share, T = S_i S-^-1 maps one

@@ -56,10 +56,10 @@ class Infeasible(RobinsError, ValueError):
         self.step, self.time_s, self.gamma = step, time_s, gamma
         self.local_bound, self.gamma_min = local_bound, gamma_min
         when = "" if time_s is None else f" (t = {time_s:g} s)"
-        whole = "" if gamma_min is None else f"; the whole run needs gamma = {gamma_min:.6g}"
+        overall = "" if gamma_min is None else f"; the whole run needs gamma = {gamma_min:.6g}"
         super().__init__(
             f"no H-infinity filter with gamma = {gamma:.6g} exists at step {step}{when}: the local "
-            f"bound sqrt(lambda_max(L P L')) is {local_bound:.6g} there{whole}",
+            f"bound sqrt(lambda_max(L P L')) is {local_bound:.6g} there{overall}",
             fix="give a larger gamma, or policy='raise_gamma' or 'compensate'; gamma has the units "
             "of L x over those of whitened noise, so look at the units of weight, R and P0 too",
         )
@@ -208,12 +208,12 @@ class HInfinity(Rule):
         return Belief(manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))), wide)
 
     def first_infeasible(
-        self, final: HInfinityMemory, before: int = 0, whole: bool = True
+        self, final: HInfinityMemory, before: int = 0, test_last: bool = True
     ) -> tuple[int, Numbers] | None:
         """First step without a filter, and L S there; None if the filter existed throughout.
 
-        ``before`` is the number of events before this run, with perhaps another gamma; ``whole``
-        also tests the last step, from which nothing has been predicted.
+        ``before`` is the number of events before this run, with perhaps another gamma. If
+        ``test_last``, the last step is tested too, from which nothing has been predicted.
         """
         missed = int(final.events) - before
         # Arrays are NumPy arrays in a stream in C and from the interpreter.
@@ -222,7 +222,7 @@ class HInfinity(Rule):
             return int(final.first), first
         if missed > 0:  # `first` is of an earlier run; after a missed step all are missed
             return int(final.steps) - 1 - missed, weighted
-        if not whole or not final.measured:
+        if not test_last or not final.measured:
             return None
         exists = inflated(jnp.eye(weighted.shape[1]), self.inverse * weighted)[1]
         return None if exists else (int(final.steps) - 1, weighted)
@@ -248,7 +248,7 @@ class HInfinity(Rule):
         if not self.reports:
             return
         before = int(start.events)
-        broken = self.first_infeasible(final, before, whole=again is not None)
+        broken = self.first_infeasible(final, before, test_last=again is not None)
         if broken is None:
             return
         step, weighted = broken

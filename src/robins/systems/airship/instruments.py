@@ -157,7 +157,7 @@ def _columns(angles: Array) -> tuple[Angle, ...]:
 def _taken_early(world: AirshipWorld):
     early = world.since.shape[1]
     sights = world.readings[STAR][:, :-1].reshape(-1, 3 * early)
-    dt = world.whole.dt[:, None] / (early + 1.0)
+    dt = world.epoch_increments.dt[:, None] / (early + 1.0)
     age = dt * jnp.arange(early, 0, -1).astype(float)[None]
     return _columns(sights), EarlySights(world.since, age)
 

@@ -155,7 +155,7 @@ def as_case(states: States, of: Taken, sigma: Array, world: AirshipWorld) -> Cas
     gyro, accel = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))
     return Case(
         start=Belief(states.of(estimate, zero, zero, jnp.zeros(2)), jnp.diag(sigma)),
-        u=world.parts if states.in_parts else world.whole,
+        u=world.parts if states.in_parts else world.epoch_increments,
         truth=states.of(world.truth, gyro, accel, world.wind_error),
         **taken(of, world),
     )

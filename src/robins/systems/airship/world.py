@@ -81,7 +81,7 @@ class AirshipCourse(NamedTuple):
 class AirshipWorld(NamedTuple):
     """One run; E epochs, NED/FRD."""
 
-    whole: Increments  # (E,), (E, 3) as reported, one for an epoch
+    epoch_increments: Increments  # (E,), (E, 3) as reported, one for an epoch
     parts: Increments  # (E, K), (E, K, 3) the same in K parts
     since: Array  # (E, S - 1, 3) rad, turn as reported from each early sight to the epoch's end
     path: Nav  # (E S,) true, at each sight of the stars
@@ -264,7 +264,7 @@ def simulate(
     through = jnp.concatenate([truth.v_n[:, :2] - blown, truth.v_n[:, 2:]], 1)
     a, of_wind = given.air_data, jax.random.fold_in(key(Component.AIR_DATA), WIND_ERROR)
     world = AirshipWorld(
-        whole=jax.vmap(joined)(single),
+        epoch_increments=jax.vmap(joined)(single),
         parts=parts,
         since=_turned_since(single),
         path=path,

@@ -96,7 +96,7 @@ class Satellites(Parameters):
     noise: q.Length = default("3 m")  # white noise at 45 dBHz
 
 
-class Streets(Parameters):
+class StreetWalls(Parameters):
     """Walls on both sides, in blocks whose height and distance are drawn for each block."""
 
     block: q.Length = default("40 m")
@@ -118,7 +118,7 @@ class City(Scenario, GnssAssumptions):
     place: Departure
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     satellites: Satellites = pydantic.Field(default_factory=Satellites)
-    streets: Streets = pydantic.Field(default_factory=Streets)
+    streets: StreetWalls = pydantic.Field(default_factory=StreetWalls)
     speed_noise: q.Speed = default("0.05 m/s")
     yaw_noise: q.AngleRate = default("0.1 deg/s")
     settle: q.Time = default("0 s")

@@ -4,7 +4,7 @@ A replay is one chunk, a live object chunks of one; any chunks of the same recor
 bits. Each time of the receiver is an epoch, and each satellite has a column, free again when
 another one needs it. Only the latency of the odometry is taken from the future: an epoch becomes a
 step when the odometry has reached it, or has passed it by a wait that is asked for. Where no epoch
-comes, steps of one second without pseudoranges follow the odometry, `patience_s` behind it.
+comes, steps of one second without pseudoranges follow the odometry, `timeout_s` behind it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class GnssPath:
         believed: GnssAssumptions,
         channels: Mapping[str, int],
         wait_s: float = 0.0,
-        patience_s: float = math.inf,
+        timeout_s: float = math.inf,
     ):
         """Make a path without records.
 
@@ -65,11 +65,11 @@ class GnssPath:
             channels: columns of each satellite system, by the first letter of its satellites.
             wait_s: time by which the odometry must be past an epoch, for earlier epochs that come
                 later.
-            patience_s: time by which a step without an epoch follows the odometry; epochs that are
+            timeout_s: time by which a step without an epoch follows the odometry; epochs that are
                 later than that come too late. In a log that ends with its epochs there is none.
         """
         self._believed, self._wait_ns = believed, round(1e9 * wait_s)
-        self._patience_ns, self._channels = 1e9 * max(patience_s, wait_s), dict(channels)
+        self._timeout_ns, self._channels = 1e9 * max(timeout_s, wait_s), dict(channels)
         self._letters = "".join(letter * count for letter, count in channels.items())
         others = np.array(list(channels)[1:], dtype=str)
         self.member = (np.array(list(self._letters))[:, None] == others[None, :]).astype(float)
@@ -131,8 +131,8 @@ class GnssPath:
             if self.time_ns is not None or self._begins(time_ns, names, rows):
                 out.append((time_ns, self._step(time_ns, names, rows)))
             self._forget(time_ns)
-        if self.time_ns is None and self.newest_ns is not None and self._patience_ns < math.inf:
-            self._forget(self.newest_ns - round(self._patience_ns))
+        if self.time_ns is None and self.newest_ns is not None and self._timeout_ns < math.inf:
+            self._forget(self.newest_ns - round(self._timeout_ns))
         return out
 
     def _due(self) -> tuple[int, list[str], np.ndarray] | None:
@@ -143,7 +143,7 @@ class GnssPath:
         ready = first_ns <= newest_ns - self._wait_ns
         if self.time_ns is not None:
             edge_ns = self.time_ns + BRIDGE_NS
-            if edge_ns < first_ns and (ready or edge_ns <= newest_ns - self._patience_ns):
+            if edge_ns < first_ns and (ready or edge_ns <= newest_ns - self._timeout_ns):
                 return edge_ns, [], np.zeros((0, 7))
         return self._waiting.pop(0) if ready else None
 

@@ -305,13 +305,13 @@ def _answers(
             first = last + 1
         notes += _share_note(found[ROBUST], parameters, fix_step_s)
         if smooths:
-            seen = [_settled(*of) for of in zip(pieces, verdicts, strict=True)]
+            seen = [_without_offsets(*of) for of in zip(pieces, verdicts, strict=True)]
             found |= navigated(seen, smooths)
     kept = {k: found[k]._replace(mean=navigation(found[k].mean)) for k in wanted}
     return kept, notes, doubts
 
 
-def _settled(piece: LogSegment, verdict: HindsightVerdict) -> LogSegment:
+def _without_offsets(piece: LogSegment, verdict: HindsightVerdict) -> LogSegment:
     """The piece without the positions that were off, with process noise scaled by the verdict."""
     world: Case = piece.world
     off = verdict.off > 0.5

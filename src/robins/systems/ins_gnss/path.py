@@ -68,7 +68,7 @@ class InsGnssPath:
         self._tick, self._ask_s = 0, 0.0  # tenth of a second of the last search for a start
         self.reach_s = reach_of_rate(usual.sample_s)
         # history needed before the oldest epoch
-        self._settled = 2 * max(2, round(p.aids.window / usual.sample_s)) + 1  # samples
+        self._settling_samples = 2 * max(2, round(p.aids.window / usual.sample_s)) + 1  # samples
         back = max(p.gnss.velocity_window or 0.0, 1.5, 4.0 * usual.fix_s)
         settling_s = 2.0 * p.aids.window + 2.0 * usual.sample_s
         self._back_s = delay_s + 2.0 * self.reach_s + back + settling_s
@@ -233,7 +233,7 @@ class InsGnssPath:
         if self._steps[0, 0] >= begin - self._back_s:
             return
         first = int(np.searchsorted(self._steps[:, 0], begin, side="right"))
-        since_s = float(self._steps[min(first + self._settled, len(self._steps) - 1), 0])
+        since_s = float(self._steps[min(first + self._settling_samples, len(self._steps) - 1), 0])
         aids, usual = self._parameters.aids, self._usual
         self._known = tuple(known_until(self._log(), aids, usual, since_s))
         # a displacement across an outage starts at the last position before it

@@ -113,15 +113,15 @@ HYPOTHESES = stacked(_ROWS)
 AS_TOLD = FixHypothesis(*np.array(_ROWS[0].numbers))
 
 
-def mode_changes(step_s: float, patience_s: float) -> np.ndarray:
+def mode_changes(step_s: float, fault_s: float) -> np.ndarray:
     """Transition probabilities (modes, modes) of a step.
 
     Args:
         step_s: duration of the step [s].
-        patience_s: mean duration of a fault of positions [s].
+        fault_s: mean duration of a fault of positions [s].
     """
-    step_s = min(step_s, 0.5 * patience_s)
-    lengths = SELDOM_S, WILD_S, patience_s
+    step_s = min(step_s, 0.5 * fault_s)
+    lengths = SELDOM_S, WILD_S, fault_s
     begin, wild, over = (-math.expm1(-step_s / length) for length in lengths)
     edges: list[Any] = [
         (same, same, scale_transitions(SCALES, RISE, FALL)) for same in (RIGHT, LASTS)
@@ -345,18 +345,18 @@ def _mode(model: Model, rule: Rule, lasting: Array | None, row: FixHypothesis) -
     return Mode(kalman(taylor(), [rule]), own.motion, mine)
 
 
-def robust(model: Model, step_s: float, patience_s: float, lasting: Array | None = None) -> Filter:
+def robust(model: Model, step_s: float, fault_s: float, lasting: Array | None = None) -> Filter:
     """Bank of filters over the hypotheses, for a model.
 
     Args:
         model: from `ins_gnss_model`; the filter runs on its `hypothesis_model`, from
             `augmented_belief`.
         step_s: interval of fixes [s], or the longest block if that is shorter.
-        patience_s: mean duration of a fault of positions [s].
+        fault_s: mean duration of a fault of positions [s].
         lasting: as in `augmented_belief`.
     """
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
     # innovations are the likeliest mode's: the large sigma of a rare fault mode would hide others
     make = Partial(_mode, model, bounded_student_t(), lasting)
-    return bank(make, _ROWS, mode_changes(step_s, patience_s), start, likeliest=True)
+    return bank(make, _ROWS, mode_changes(step_s, fault_s), start, likeliest=True)

@@ -43,7 +43,7 @@ def at_samples(
         )
         block = piece.world.u.increments
         dt = np.asarray(block.dt)
-        found = named_scan(_through, np.zeros(1), (before, Increments(*block[:3])))[1]
+        found = named_scan(_navigate_block, np.zeros(1), (before, Increments(*block[:3])))[1]
         begins = np.append(piece.begin_s, piece.epoch_s[:-1])[:, None]
         ends = np.where(dt > 0.0, begins + np.cumsum(dt, axis=1), -np.inf)
         last = np.argmax(ends, axis=1)
@@ -55,7 +55,7 @@ def at_samples(
     return np.concatenate(times), np.concatenate(rows)
 
 
-def _through(carry: Array, row: tuple[InsState, Increments]) -> tuple[Array, Array]:
+def _navigate_block(carry: Array, row: tuple[InsState, Increments]) -> tuple[Array, Array]:
     return carry, path(*row)
 
 

@@ -287,8 +287,8 @@ class SamplePath:
         still, sigma, looks = np.zeros(len(times), bool), np.zeros(len(times)), []
         for k, dt in enumerate(times):
             still[k], sigma[k] = self._watch.look(dt, rate[k], force[k], field_b[k])
-            at_home = self._watch.first is not None
-            looks.append(self._sites.look(dt, bool(still[k]), at_home, force[k], field_b[k]))
+            starts_at_rest = self._watch.first is not None
+            looks.append(self._sites.look(dt, bool(still[k]), starts_at_rest, force[k], field_b[k]))
         weight = p.accelerometer.gravity * np.asarray(integrals.dt_s)
         falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
         self.counts["blocks_in_free_fall"] += int(np.sum(falling))

@@ -43,14 +43,14 @@ class Sites:
         self._sums = np.zeros((2, 3))  # time integrals of field and specific force over this rest
 
     def look(
-        self, dt_s: float, still: bool, at_home: bool, force: np.ndarray, field: np.ndarray
+        self, dt_s: float, still: bool, starts_at_rest: bool, force: np.ndarray, field: np.ndarray
     ) -> Look:
         """Process a block; return the site read at its end, or `NONE`.
 
         Args:
             dt_s: s, its duration.
             still: the unit lies still in it.
-            at_home: the log begins with rest.
+            starts_at_rest: the log begins with rest.
             force: (3,) m/s^2, mean specific force.
             field: (3,) T in body axes; NaN if there is none.
         """
@@ -77,8 +77,8 @@ class Sites:
         dip = float(np.arcsin(np.clip(sine, -1.0, 1.0)))
         seen = np.array([strength, dip])
         if np.all(np.isnan(self._known)):
-            self._known[0] = seen if at_home else np.inf
-            if at_home:
+            self._known[0] = seen if starts_at_rest else np.inf
+            if starts_at_rest:
                 return NONE
         site = self._number(seen)
         return (site, mean, dip) if site >= 0 else NONE

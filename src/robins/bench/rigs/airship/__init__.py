@@ -59,13 +59,13 @@ WIRE = Wire(
 # fmt: on
 
 
-def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
+def _shift_fix(values: Values, fault: LinkFault, _: int) -> Values:
     """Offset the radar fix, as a match with a wrong place does."""
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 
 _DEVICE_FAULTS = {
-    "shifted": DeviceFault("radar", "fix", "sensed", _shifted, ("shift",)),
+    "shifted": DeviceFault("radar", "fix", "sensed", _shift_fix, ("shift",)),
     "blind": DeviceFault("star", "attitude", "blind", nothing),
     "stuck": DeviceFault("air", "wind", "repeated"),
 }

@@ -70,7 +70,7 @@ WIRE = Wire(
 # fmt: on
 
 
-def _shifted(values: Values, fault: LinkFault, _: int) -> Values:
+def _shift_fix(values: Values, fault: LinkFault, _: int) -> Values:
     """Fix shifted to the north."""
     return {**values, "lat": values["lat"] + fault.shift / 6.378137e6}
 
@@ -82,7 +82,7 @@ def _blind(values: Values, *_: Any) -> Values:
 
 
 _DEVICE_FAULTS = {
-    "shifted": DeviceFault("gnss", "fix", "sensed", _shifted, ("shift",)),
+    "shifted": DeviceFault("gnss", "fix", "sensed", _shift_fix, ("shift",)),
     "stuck": DeviceFault("gnss", "fix", "repeated"),
     "blind": DeviceFault("gnss", "fix", "blind", _blind),
 }

@@ -201,10 +201,10 @@ def ardupilot(config: MultirotorConfig) -> Part:
     """The physics' side of the connection to ArduPilot, which simulates its own sensors."""
     lines: list[of_ardupilot.ArduPilotPhysics] = []
 
-    def asked(patience_s: float, fix: str) -> of_ardupilot.Servos:
-        servos, where = lines[0].receive(patience_s), f"ArduPilot at port {lines[0].port}"
+    def asked(timeout_s: float, fix: str) -> of_ardupilot.Servos:
+        servos, where = lines[0].receive(timeout_s), f"ArduPilot at port {lines[0].port}"
         if servos is None:
-            raise BridgeTimeout(f"nothing came within {patience_s:g} s", where, fix)
+            raise BridgeTimeout(f"nothing came within {timeout_s:g} s", where, fix)
         if servos.restarted:
             raise BridgeClosed("it was started anew in the middle of the run", where)
         return servos
