@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class RobinsError(Exception):
-    """The base of all errors of robins: one sentence, ``where: what; fix``.
+    """Base class of all errors of robins: one sentence, ``where: what; fix``.
 
     Most are also a ValueError, for callers that catch those.
 

@@ -121,7 +121,7 @@ class Latencies:
     def cycle(
         self, step: int, deadline_ns: int | None, began_ns: int, ended_ns: int, missed: bool
     ) -> None:
-        """Record the end of a step: all parts are done, or its time is over.
+        """Record the end of a step: all parts are done, or its time is up.
 
         Args:
             step: its number.

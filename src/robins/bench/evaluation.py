@@ -210,7 +210,7 @@ def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
 
 
 def rms(error: np.ndarray) -> float | None:
-    """RMS length of the rows (E, ...) that are whole; None: there is none."""
+    """RMS norm of the rows (E, ...) without NaN; None: there are none."""
     squares = np.sum(np.square(error), axis=tuple(range(1, error.ndim)))
     known = squares[np.isfinite(squares)]
     return float(np.sqrt(np.mean(known))) if len(known) else None

@@ -41,7 +41,7 @@ __getattr__ = moved(__name__)
 
 
 class RigError(RobinsError, ValueError):
-    """A rig that contradicts itself."""
+    """Inconsistent definition of a rig."""
 
 
 def named(where: str) -> Any:
@@ -77,7 +77,7 @@ class RunConfig(Protocol):
 
     @property
     def frames(self) -> Iterable[int]:
-        """One step of each kind that takes different code, to be compiled before the first step."""
+        """Numbers of the steps to compile before the run: one for each path through the code."""
         ...
 
 

@@ -87,7 +87,9 @@ class JaxMachine:
         self._programs: dict[str, Future[Any]] = {}  # being compiled
 
     def width(self, runs: int) -> int:
-        """Runs of a chunk in a campaign of so many, by the memory that JAX needs for them."""
+        """Number of runs in a chunk, for a campaign of this size, limited by the memory that JAX
+        needs.
+        """
         width = filled(runs)
         each = -(-bytes_of_batch(self.problem, self._batch, width) // width)
         width = min(width, width_of(each, MEMORY))
@@ -204,7 +206,7 @@ class LaneMachine:
         ] + memory_note(self.bytes_of_run, LEAST)
 
     def width(self, runs: int) -> int:
-        """Runs of a chunk in a campaign of so many, by the memory that they need."""
+        """Number of runs in a chunk, for a campaign of this size, limited by memory."""
         return min(width_of(self.bytes_of_run, CHUNK_BYTES), -(-runs // LEAST) * LEAST)
 
     def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole_record) -> Iterator[Simulated]:
@@ -294,7 +296,7 @@ class LaneMachine:
 
 @contextmanager
 def threads(count: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads with stacks large enough for lanes and compilers; pending work is cancelled."""
+    """Thread pool with stacks large enough for lanes and compilers; exit cancels pending work."""
     before = threading.stack_size(STACK)
     pool = ThreadPoolExecutor(count)
     try:

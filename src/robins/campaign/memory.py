@@ -18,7 +18,7 @@ MEMORY = 768 << 20  # bytes of all chunks at once
 
 
 def filled(runs: int, most: int = CHUNK) -> int:
-    """Runs of a chunk regardless of memory: all, up to half of `most`; else `most`.
+    """Number of runs in a chunk regardless of memory: all, up to half of `most`; else `most`.
 
     The last chunk is filled up, so that 50 and 1000 runs need one program.
     """
@@ -26,7 +26,7 @@ def filled(runs: int, most: int = CHUNK) -> int:
 
 
 def width_of(bytes_of_run: int, most: int) -> int:
-    """Runs of a chunk that takes so many bytes at most.
+    """Number of runs in a chunk of at most this many bytes.
 
     A multiple of `LEAST` up to `CHUNK`; `SOME` instead of a few more.
     """

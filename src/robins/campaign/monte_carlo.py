@@ -98,7 +98,7 @@ Over = Callable[[Callable[..., Any], Any], Any]  # maps a function over the rows
 
 
 def at_once(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
-    """All rows in one batch."""
+    """Apply a function to all rows in one batch."""
     return jax.vmap(function)(rows)
 
 
@@ -171,7 +171,7 @@ def batch_of(problem: Problem) -> PyTree:
 
 
 def bytes_of_batch(problem: Problem, batch: PyTree, width: int) -> int:
-    """Approximate peak memory of JAX for a chunk of so many runs.
+    """Approximate peak memory [bytes] of JAX for a chunk of this many runs.
 
     The traces are used again when a chunk of this width is computed.
 
@@ -185,7 +185,7 @@ def bytes_of_batch(problem: Problem, batch: PyTree, width: int) -> int:
 
 
 def traced(problem: Problem, batch: Callable, width: int) -> dict[str, Traced]:
-    """The programs of all filters for a chunk of so many runs, by name, not compiled yet."""
+    """Programs of all filters, by name, for a chunk of this many runs; not compiled yet."""
     many = jax.eval_shape(batch, _numbers(width))
     return {name: _records.trace(*_given(problem, name), many) for name in problem.contenders}
 

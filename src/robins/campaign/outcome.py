@@ -285,7 +285,7 @@ def _scatter(b: StateBlock, found: dict[str, Statistics]) -> Variables:
 
 
 def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Variable]:
-    """Probability that each suspect is wrong, in the first run and over all, and the truth."""
+    """Fault probability of each suspect, in the first run and over all runs, and the truth."""
     data = tables("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
     if not data:
         return {}

@@ -49,7 +49,7 @@ Path = tuple[str | int, ...]  # names of fields and numbers of items, from the p
 
 
 class ParameterRange(NamedTuple):
-    """Numbers that one key of the parameters stands for, such as three axes, and their ends."""
+    """Range of the numbers of one parameter key, such as those of three axes."""
 
     paths: tuple[Path, ...]
     low: tuple[float, ...]  # SI
@@ -67,13 +67,13 @@ class ParameterRange(NamedTuple):
         return "log-uniform" if self.by_logarithm else "uniform"
 
     def at(self, share: Any) -> dict[Path, Any]:
-        """The numbers at a share from 0 to 1 of the way from the low ends to the high ones."""
+        """Numbers at a fraction, from 0 to 1, of the range."""
         ends = zip(self.paths, self.low, self.high, strict=True)
         return {path: one_at(share, a, b, self.by_logarithm) for path, a, b in ends}
 
 
 def one_at(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
-    """A number at a share from 0 to 1 of the way between its ends."""
+    """Number at a fraction, from 0 to 1, between its ends."""
     return low * (high / low) ** share if by_logarithm else low + (high - low) * share
 
 
@@ -160,7 +160,7 @@ class SensitivityRuns(NamedTuple):
 
 
 def _believed(start: Any) -> Array:
-    """Sum of the log variances of a belief: any standard deviation changes it, in any unit."""
+    """Sum of the log variances of a belief, which any standard deviation in any unit changes."""
     if not isinstance(start, Belief):
         return jnp.zeros(())
     size = jnp.sum(jnp.asarray(start.factor, float) ** 2, axis=-1)

@@ -339,7 +339,7 @@ class Statistics:
         return [name.removeprefix("wrong ") for name in names]
 
     def wrong(self, suspect: str) -> np.ndarray:
-        """(E,) mean probability that a suspect is wrong."""
+        """(E,) mean fault probability of a suspect."""
         return self.sums[f"wrong {suspect}"] / self.runs
 
     def first_wrong(self, suspect: str) -> np.ndarray:

@@ -37,7 +37,7 @@ class FolderStore:
         self.where = str(path)
 
     def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
-        """Put an object in place whole, or leave the one that is there; True if it was put.
+        """Store an object atomically unless it exists; True if it was stored.
 
         Args:
             name: of the object.
@@ -70,7 +70,7 @@ class FolderStore:
         return placed
 
     def get(self, name: str) -> bytes | None:
-        """All of an object; None where there is none."""
+        """Content of an object; None if it does not exist."""
         try:
             return (self.path / name).read_bytes()
         except FileNotFoundError:
@@ -88,11 +88,11 @@ class FolderStore:
             raise self._cannot(f"list {group}", error) from error
 
     def drop(self, name: str) -> None:
-        """Remove an object, if it is there."""
+        """Remove an object if it exists."""
         (self.path / name).unlink(missing_ok=True)
 
     def sweep(self) -> None:
-        """Remove what writers that died have left half-written."""
+        """Remove incomplete files left by writers that died."""
         for left in self.names(_PARTIAL):
             path = self.path / _PARTIAL / left
             with suppress(OSError):
@@ -113,7 +113,7 @@ class FolderStore:
 
 
 def _link(partial: Path, target: Path) -> bool:
-    """Give a whole file its name unless that is taken."""
+    """Link a complete file to its name unless the name is taken."""
     try:
         os.link(partial, target)
     except FileExistsError:
@@ -171,7 +171,7 @@ class ObjectStore:
 
     @contextmanager
     def _naming(self, what: str) -> Iterator[None]:
-        """State what failed; an object that exists, or is missing, is no failure."""
+        """State what failed; an object that exists, or is missing, is not a failure."""
         errors = self._obstore.exceptions
         try:
             yield

@@ -37,7 +37,7 @@ _LOST = 1e6  # objective where a filter diverges
 
 
 class Trial(NamedTuple):
-    """A filter at some x.
+    """Filter at given parameters x.
 
     Attributes:
         kind: where it differs, measures may be discontinuous, as by another threshold.
@@ -96,7 +96,7 @@ class Tuned(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """True if it is better on the data held out, beyond chance."""
+        """True if it is significantly better on the held-out data."""
         return self.gain_low > 0.0
 
 
@@ -253,7 +253,7 @@ def _by_mean(total: Callable[[np.ndarray], float], mean: np.ndarray) -> np.ndarr
 
 
 def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
-    """The x at which the objective is least."""
+    """Minimiser x of the objective."""
     edge = [(-FARTHEST, FARTHEST)] * p
     if slopes.gradient:
 
@@ -311,7 +311,7 @@ def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np
 
 
 def _along(row: np.ndarray, spread: np.ndarray) -> float:
-    """Standard deviation of a component; infinite if an undetermined axis adds to it."""
+    """Standard deviation of a component; infinite if an undetermined axis contributes to it."""
     endless = np.isinf(np.diag(spread))
     if np.any(endless & (np.abs(row) > 1e-6)):
         return math.inf

@@ -175,7 +175,7 @@ FILTER = option("--filters", "filter_name", callback=of_value(_one_filter), **_F
 
 
 def choices(command: Callable) -> Callable:
-    """Options that commands share which compute a campaign."""
+    """Options shared by the commands that compute a campaign."""
     return MACHINE(SEED(SETTINGS(FILTERS(TRUST(answers(command))))))
 
 

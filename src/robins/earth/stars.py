@@ -51,7 +51,7 @@ class Stars(NamedTuple):
 
 
 def synthetic(limit: float = 6.0, seed: int = 0) -> Stars:
-    """A sky of stars uniform over the sphere, with as many to each magnitude as the real one has.
+    """Stars distributed uniformly over the sphere, with the magnitude counts of the real sky.
 
     There are N(<m) = 10^(0.4888 m + 0.7261) stars brighter than m, rounded: 480, 1479, 4559 to
     magnitudes 4, 5, 6. A fainter limit adds stars and leaves the others unchanged. The real sky has
@@ -152,7 +152,7 @@ class StarIndex(NamedTuple):
 
 
 def refuse_other_lengths(unit_i: np.ndarray) -> None:
-    """Refuse directions (N, 3) that are no unit vectors.
+    """Refuse directions (N, 3) that are not unit vectors.
 
     Raises:
         ValueError: a length differs from one.

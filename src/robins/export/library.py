@@ -24,7 +24,7 @@ from robins.program.wrap import COLUMNS, wrapped
 
 
 def template(name: str) -> str:
-    """A text among the files of this room."""
+    """Text of a template file of this package."""
     return (files("robins.export") / name).read_text("utf-8")
 
 
@@ -98,7 +98,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[StructField]:
 
 
 def filled(fields: Sequence[StructField], tree: PyTree) -> Iterator[tuple[StructField, np.ndarray]]:
-    """Fields of a struct with their numbers; a leaf without numbers is no field."""
+    """Fields of a struct with their numbers; a leaf without numbers is not a field."""
     leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
     return zip(fields, [x for x in leaves if x.size], strict=True)
 
@@ -280,12 +280,12 @@ def _declared(text: str, note: str) -> list[str]:
 
 
 def _within(comment: str) -> str:
-    """A text that neither ends the comment it stands in nor begins another."""
+    """Text made safe for a C comment: it neither ends the comment nor begins another."""
     return comment.replace("*/", "* /").replace("/*", "/ *")
 
 
 def number(value: float | int | np.generic, real: bool, precision: Precision = DOUBLE) -> str:
-    """A number in C, to the bit."""
+    """C literal of a number, exact to the bit."""
     return precision.number(value) if real else str(int(value))
 
 

@@ -44,7 +44,7 @@ EntryFunction = Callable[..., tuple[FilterState, PredictionResult | UpdateResult
 
 
 class BoardRun(NamedTuple):
-    """A simulated run, as a board is given it.
+    """Simulated run with the inputs given to a board.
 
     Attributes:
         case: with the truth and all that the filter is given, also where it ran in closed loop.

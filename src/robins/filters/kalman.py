@@ -232,7 +232,9 @@ def _outcome(o: Observation) -> Array:
 
 
 def _aside(sound: Array, S_y: Array) -> Array:
-    """Factor S_y, or the identity where unsound: dividing by NaN would make all gradients NaN."""
+    """Factor S_y, or the identity where it is invalid: dividing by NaN would make all gradients
+    NaN.
+    """
     return jnp.where(sound, S_y, jnp.eye(S_y.shape[0]))
 
 

@@ -28,7 +28,7 @@ else:
 
 
 def kind(**how: Any) -> Any:
-    """Field of a static value: another one compiles again."""
+    """Dataclass field of a static value: changing it compiles again."""
     return dataclasses.field(metadata={"kind": True}, **how)
 
 

@@ -152,7 +152,7 @@ def cached_by_name(
 def remembered(
     known: OrderedDict[Hashable, T], key: Hashable, make: Callable[[], T], most: int
 ) -> T:
-    """Value by its key, made where it is not known; of more than `most` the oldest is forgotten."""
+    """Cached value of a key, computed if missing; beyond `most` entries the oldest is dropped."""
     if key not in known:
         known[key] = make()
         if len(known) > most:

@@ -59,7 +59,7 @@ def last_uses(stages: Sequence[StageMemory], kept: Collection[Variable]) -> list
 def most_bytes(
     stages: Sequence[StageMemory], given: Iterable[Variable], kept: Collection[Variable]
 ) -> int:
-    """The most bytes that all values take at once, if each is dropped after its last use.
+    """Peak memory [bytes] of all values, each dropped after its last use.
 
     Args:
         stages: in an order of computation.
@@ -76,7 +76,7 @@ def most_bytes(
 
 
 def bytes_of_jaxpr(jaxpr: jex.Jaxpr) -> int:
-    """The most bytes that the values of a jaxpr take at once, one equation after the other.
+    """Peak memory [bytes] of the values of a jaxpr, computed one equation after the other.
 
     An upper estimate: XLA fuses equations, whose intermediate values are then never in memory.
     """

@@ -171,7 +171,7 @@ class JaxprWriter:
     def taken(
         self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: np.ndarray | None = None
     ) -> Nodes:
-        """Nodes of one more argument; zero: (shape) which of its entries are known to be zero."""
+        """Nodes of a further argument; zero: mask of its entries that are known to be zero."""
         leaf = Leaf(shape, dtype, kind_of(dtype, path), path or f"arguments[{len(self.inputs)}]")
         count = counts(self.inputs)[leaf.kind != "real"]
         self.inputs.append(leaf)

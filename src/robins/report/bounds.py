@@ -191,7 +191,7 @@ class BoundRow(NamedTuple):
 
 
 def rows(solution: xr.Dataset, at: Sequence[int]) -> list[BoundRow]:
-    """One row a component, at the numbers of some epochs."""
+    """One row per component, at the epochs with these numbers."""
     out, names = [], sensors(solution)
     for block in blocks(solution):
         start = np.asarray(find(solution, "bound_left")[block], float)
@@ -256,7 +256,7 @@ def sentences(solution: xr.Dataset) -> list[str]:
 
 
 def csv(solution: xr.Dataset) -> str:
-    """The bound over time in SI units, one column a component; of all sensors and without each."""
+    """Bound over time in SI units, one column per component: with all sensors, and without each."""
     heads, columns = ["time_s"], [np.asarray(solution["time"], float)]
     kinds = [("bound", "bound", None), ("unaided", "bound_unaided", None)]
     kinds += [(f"without_{s}", "bound_without", i) for i, s in enumerate(sensors(solution))]

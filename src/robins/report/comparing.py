@@ -88,7 +88,7 @@ _LEAST = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 2))}
 
 @style.styled
 def trade_off(solution: xr.Dataset) -> Picture:
-    """A line for each method through its designs, and their distance from the best for a gamma."""
+    """Line through the designs of each method, and their distance from the best for a gamma."""
     h2, hinf, kalman_h2, kalman_hinf = (find(solution, role)[""] for role in _ROLES)
     gamma = series.x_of(h2, 1)
     value, reached = np.asarray(h2.values, float), np.asarray(hinf.values, float)

@@ -49,7 +49,9 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
 
 
 def _used(solution: xr.Dataset) -> xr.DataArray | None:
-    """Local bound over gamma (filter, time), NaN for other filters; None if all are other."""
+    """Local bound over gamma (filter, time), NaN for filters without one; None if no filter has
+    one.
+    """
     notes, ratio = find(solution, "note"), None
     for rule, below in _WORST_CASE.items():
         bound, gamma = (notes.get(f"{rule}_{kind}") for kind in ("bound", below))
@@ -114,7 +116,7 @@ _STEEP = 3.0  # a start this many times higher than the rest is cut off, with a 
 def _scale(
     axes: Axes, x: np.ndarray, lines: list[np.ndarray], errors: np.ndarray, centred: bool = True
 ) -> None:
-    """Scale to the time after the start if the start is far higher, with a remark.
+    """Scale to the time after the start if values at the start are far larger, with a remark.
 
     Only the start is cut off: a later divergence must stay visible. A stated sigma far above all
     errors leaves the figure.
@@ -156,7 +158,7 @@ def _or_bound(solution: xr.Dataset) -> str:
 
 @style.styled
 def errors(solution: xr.Dataset, block: str) -> Picture:
-    """Estimation errors of a block of the state within the three sigma the filters state."""
+    """Estimation errors of a block of the state, in the stated three-sigma envelopes."""
     error = series.required(solution, "error", block)
     sigma = series.get(solution, "sigma", block)
     best = bounds.comparison_bound(solution, block)
@@ -209,7 +211,9 @@ def _envelope(
 
 @style.styled
 def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Picture:
-    """Estimates of a block of the state, within three sigma: biases, or a path without truth."""
+    """Estimates of a block of the state in their three-sigma envelopes: biases, or a path without
+    truth.
+    """
     found = series.required(solution, role, block)
     sigma = series.get(solution, "sigma", block)
     filters = series.filters(solution)

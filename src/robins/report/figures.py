@@ -54,7 +54,7 @@ def _scatters(solution: xr.Dataset, block: str) -> bool:
 
 
 def _tells_more(solution: xr.Dataset, block: str) -> bool:
-    """True if an estimate shows more than its error, as one that should converge to a constant."""
+    """True if an estimate shows more than its error, such as one that should become constant."""
     return block not in find(solution, "error") or "bias" in block or "scale" in block
 
 

@@ -198,6 +198,6 @@ def _frame(
 
 
 def _round(length: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to a length."""
+    """Largest of 1, 2 or 5 times a power of ten that does not exceed a length."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * 1.000001)

@@ -131,7 +131,7 @@ def band(value: Json) -> str:
 
 
 def outside(values: Values, metric: str) -> bool:
-    """True if a metric lies outside its own band, the metric of that name with `_band` behind."""
+    """True if a metric lies outside its own band, the metric of the same name plus `_band`."""
     value, limits = values.get(metric), values.get(f"{metric}_band")
     if not isinstance(value, int | float) or not isinstance(limits, Sequence) or len(limits) != 2:
         return False
@@ -140,12 +140,12 @@ def outside(values: Values, metric: str) -> bool:
 
 
 def marked(values: Values, metric: str) -> str:
-    """A metric as `show` has it, with `MARK` behind it where it lies outside its band."""
+    """Metric formatted by `show`, followed by `MARK` if it lies outside its band."""
     return show(values.get(metric)) + (MARK if outside(values, metric) else "")
 
 
 def state_of(verdict: str) -> str:
-    """The claim verdict whose colour the sentence on a replay has; "" for none."""
+    """Claim verdict that sets the colour of the sentence on a replay; "" for none."""
     return next((state for begin, state in _STATES.items() if verdict.startswith(begin)), "")
 
 

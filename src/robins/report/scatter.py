@@ -14,7 +14,7 @@ _WHOLE = 100  # runs below which the highest percentile is the largest of them
 
 @style.styled
 def percentiles(solution: xr.Dataset, block: str) -> Picture:
-    """Median, the middle nine tenths, and the highest percentile of the length of an error."""
+    """Median, central 90 % range, and highest percentile of the length of an error."""
     data = series.required(solution, "percentile", block)
     filters = series.filters(solution)
     tinted = len(filters) <= style.TINTED

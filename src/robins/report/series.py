@@ -116,7 +116,7 @@ def clock(*times: np.ndarray) -> TimeUnit:
 def single_axes(
     solution: xr.Dataset, x: np.ndarray, label: str, height: float = 2.8
 ) -> tuple[Figure, Axes, TimeUnit]:
-    """A figure of one pair of axes over time, outages shaded."""
+    """Figure with a single plot over time, outages shaded."""
     figure, grid = style.new_figure(1, 1, height)
     axes, unit = grid[0, 0], clock(x)
     unit.shade(axes, solution)
@@ -128,7 +128,7 @@ def single_axes(
 def stacked(
     solution: xr.Dataset, data: Series, more: int = 0
 ) -> tuple[Figure, np.ndarray, TimeUnit]:
-    """A figure of one pair of axes over time for each component, outages shaded.
+    """Figure with a plot over time for each component, outages shaded.
 
     ``more`` pairs are added below. Components of different units state their own.
     """

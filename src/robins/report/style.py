@@ -99,7 +99,7 @@ def panels(
     sharex: bool = False,
     sharey: bool = False,
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of so many pairs of axes, three to a row; those left over are hidden.
+    """Figure with this many axes, three per row; unused ones are hidden.
 
     Args:
         count: of the axes.

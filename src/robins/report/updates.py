@@ -143,7 +143,7 @@ def _compress(axes: Axes, values: list[np.ndarray]) -> None:
 
 
 def _round_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten."""
+    """Next larger of 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(min(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
 

@@ -66,7 +66,7 @@ def imu(
     body: BodyFrame | None = None,
     nav: NavFrame | None = None,
 ) -> Imu:
-    """A sample of inertial sensors.
+    """Imu message of a sample of inertial sensors.
 
     Args:
         omega_b: (3,) turn rate against inertial space [rad/s].
@@ -93,7 +93,7 @@ def imu(
 def magnetic_field(
     field_t: ArrayLike, *, covariance: ArrayLike | None = None, body: BodyFrame | None = None
 ) -> MagneticField:
-    """A sample of a magnetometer.
+    """MagneticField message of a sample of a magnetometer.
 
     Args:
         field_t: (3,) [T], along the body's axes.
@@ -113,7 +113,7 @@ def nav_sat_fix(
     status: int | None = None,
     service: int = 0,
 ) -> NavSatFix:
-    """A fix of a GNSS receiver.
+    """NavSatFix message of a fix of a GNSS receiver.
 
     Args:
         lat_rad: latitude.
@@ -146,7 +146,7 @@ def odometry(
     body: BodyFrame | None = None,
     nav: NavFrame | None = None,
 ) -> Odometry:
-    """A pose and a velocity; quantities not given are NaN.
+    """Odometry message of a pose and a velocity; quantities not given are NaN.
 
     Args:
         r_n_m: (3,) position along the axes of nav [m].

@@ -61,7 +61,7 @@ def accelerate(to_mps: float, duration_s: float) -> Manoeuvre:
 
 
 def stop(duration_s: float) -> Manoeuvre:
-    """Brake to a stand."""
+    """Brake to a standstill."""
     return accelerate(0.0, duration_s)
 
 

@@ -46,7 +46,7 @@ Address = tuple[str, int]
 
 
 class Servos(NamedTuple):
-    """A packet of ArduPilot."""
+    """Packet of servo outputs from ArduPilot."""
 
     frame: int  # number of the packet since ArduPilot started
     rate_hz: int  # rate that ArduPilot requests; the physics may use another
@@ -149,7 +149,7 @@ class ArduPilotCounts:
 
 
 class ArduPilotPhysics(Closing):
-    """UDP socket that ArduPilot sends to; closes as a context manager. For one thread.
+    """UDP socket that ArduPilot sends to, as a context manager. Not thread-safe.
 
     Attributes:
         port: to which ArduPilot has to send.
@@ -192,7 +192,7 @@ class ArduPilotPhysics(Closing):
         self._socket.close()
 
     def admits(self, sender: Address) -> bool:
-        """True if datagrams of this address are accepted.
+        """True if datagrams from this address are accepted.
 
         The bound address always is. Another is accepted if no address is bound yet; or if it is on
         the same machine, that machine is this one (loopback) or the declared peer, and the bound

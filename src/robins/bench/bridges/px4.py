@@ -46,7 +46,7 @@ class Px4Counts:
 
 
 class Px4Simulator(Closing):
-    """TCP server that PX4 connects to; closes as a context manager. For one thread.
+    """TCP server that PX4 connects to, as a context manager. Not thread-safe.
 
     Attributes:
         port: to which PX4 has to connect.

@@ -97,7 +97,7 @@ def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
 
 
 class Ros2Topics(Closing):
-    """A session of Zenoh with publishers and subscribers of ROS topics; closes as a context.
+    """Zenoh session with publishers and subscribers of ROS topics, as a context manager.
 
     Attributes:
         bad: samples that could not be decoded as their topic's type.

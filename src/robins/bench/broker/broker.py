@@ -56,7 +56,7 @@ class Broker:
         idle_s: Callable[[str], float] = lambda part: math.inf,
         waiting: Callable[[Sequence[str], float], None] = lambda parts, since_s: None,
     ):
-        """Take the links of a run.
+        """Set up the hub for the links of a run.
 
         Args:
             links: by part.
@@ -191,7 +191,7 @@ class Broker:
             self._wait(timeout_ns, again_ns, most_ns)
 
     def _wait(self, timeout_ns: int | None, again_ns: int, most_ns: int) -> None:
-        """Repeat the tick of parts that have not answered, or give them up."""
+        """Repeat the tick to parts that have not answered, or give up on them."""
         now = _CLOCK_NS()
         for name, (at_ns, last_ns) in list(self._ticked.items()):
             if name in self._done:
@@ -290,7 +290,8 @@ class Broker:
     # ----------------------------------------------------------------------------------- the wire
 
     def poll(self, timeout_s: float) -> None:
-        """Receive for up to a time, pass messages on, write pending bytes; return once some came.
+        """Receive for up to a given time, pass messages on, write pending bytes; return as soon as
+        some arrive.
 
         Raises:
             LinkLost: the far end of a port is gone.
@@ -388,7 +389,7 @@ class Broker:
     # ------------------------------------------------------------------------------------- the end
 
     def stop(self) -> None:
-        """Send every part the end of the run."""
+        """Notify every part of the end of the run."""
         for link in self.links.values():
             try:
                 self._put(link, "stop", b"", self.time_ns)

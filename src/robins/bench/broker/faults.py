@@ -93,7 +93,7 @@ class FaultTable(NamedTuple):
 
 
 class LinkFault(Parameters):
-    """A fault on a link from `begin` (included) to `end` (excluded; left out: for good).
+    """Fault on a link from `begin` (included) to `end` (excluded; omitted: permanent).
 
     Times are those of the clock of the run: a step has that of its end.
 

@@ -69,7 +69,7 @@ class Injector:
     """
 
     def __init__(self, table: FaultTable, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
-        """Take the faults of a run.
+        """Set up the faults of a run.
 
         Args:
             table: the faults of the rig.
@@ -171,7 +171,9 @@ class Injector:
         return [one.piece for one in due]
 
     def _hit(self, where: tuple[str, str], one: _Fault) -> int | None:
-        """Count of frames that a fault met on a link before this one; None: this one is spared."""
+        """Number of earlier frames on a link that a fault affected; None: it does not affect this
+        one.
+        """
         stream = one.number, *where
         count = self._met[stream]
         self._met[stream] += 1

@@ -187,7 +187,7 @@ class Link:
         return self._lines is not None
 
     def next_ns(self) -> int | None:
-        """Time at which the line has carried another byte [ns], on the clock of `flush`."""
+        """Time [ns] at which the line will have carried the next byte, on the clock of `flush`."""
         if self._lines is None:
             return None
         times = [t for line in self._lines if (t := line.next_ns) is not None]

@@ -14,7 +14,7 @@ LONGEST_S = 3600.0  # duration of a fault; without one it lasts until it is clea
 
 
 class CommandError(RobinsError, ValueError):
-    """Text of a page that is no command; the message is for the page."""
+    """Text from a page that is not a command; the message is for the page."""
 
 
 def read(

@@ -46,7 +46,7 @@ def same_origin(origin: str | None, host: str) -> bool:
 
 
 class Guard:
-    """Middleware: answers other sites with 403, and forbids browsers to load from other sites."""
+    """Middleware: other sites get 403, and browsers are forbidden to load from other sites."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -135,7 +135,7 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
 
 @dataclass
 class Pair(Closing):
-    """Two ends of a pseudo-terminal, as a cable between bench and part; closes as a context.
+    """Two ends of a pseudo-terminal, as a cable between bench and part; a context manager.
 
     Attributes:
         master: the bench's end, a file descriptor: raw, non-blocking.

@@ -342,7 +342,7 @@ class _PartLifetime:
         self._tick = step
 
     def said(self, row: _LinkRow) -> None:
-        """Take a recorded answer."""
+        """Add a recorded answer."""
         for frame in row.found:
             head = frame.header
             # the bench may have received a frame twice: a fault doubled it, or the part died after
@@ -357,7 +357,7 @@ class _PartLifetime:
                 self._answered = max(self._answered, step)
 
     def says(self, frame: Frame) -> None:
-        """Take a new answer."""
+        """Add a new answer."""
         self._says(frame)
         self._compared.take(1, frame)
         self._now[frame.header.sequence] = frame

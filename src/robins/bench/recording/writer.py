@@ -95,7 +95,7 @@ class Recorder(Closing):
             raise
 
     def write(self, entry: layout.Entry, time_ns: int | None = None) -> None:
-        """Take an entry: a frame or bytes that went over a link.
+        """Record an entry: a frame or bytes that went over a link.
 
         Args:
             entry: with its time of arrival.
@@ -119,7 +119,7 @@ class Recorder(Closing):
             self._add(channel, received_ns, made.time_ns, made.data)
 
     def event(self, event: layout.Event) -> None:
-        """Take an event.
+        """Record an event.
 
         Raises:
             RecordingError: JSON cannot hold its fields.
@@ -241,7 +241,7 @@ class _Disk:
 
 
 def _time_ns(data: bytes, otherwise: int) -> int:
-    """Time in the header of a frame [ns]; ``otherwise`` of bytes that are no frame."""
+    """Time in the header of a frame [ns]; ``otherwise`` for bytes that are not a frame."""
     if len(data) < 2 or data[0] or data[-1]:
         return otherwise
     try:

@@ -48,13 +48,13 @@ class RunObserver(Protocol):
     """Observer of a run, such as the live page; its calls must return at once."""
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Take an event."""
+        """Handle an event."""
 
     def step(self, session: Session, step: int) -> None:
-        """A step is over."""
+        """Handle the end of a step."""
 
     def over(self, session: Session, failed: bool) -> None:
-        """The run is over."""
+        """Handle the end of the run."""
 
     def commands(self, session: Session) -> list[JsonObject]:
         """Commands of the observer; see `robins.bench.live.LivePage.commands`."""

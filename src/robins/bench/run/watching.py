@@ -56,7 +56,7 @@ class PageObserver:
     """Observer of a run, for page and status file; a `robins.bench.run.session.RunObserver`."""
 
     def __init__(self, page: Page | None, status: BenchStatus):
-        """Take the page, if there is one."""
+        """Set up the observer, with the page if there is one."""
         self._page, self._status = page, status
         self._told = 0.0
         self._due = 0.0  # time of the next sample for the page
@@ -68,14 +68,14 @@ class PageObserver:
         self._spans = FaultSpans()
 
     def over(self, session: Session, failed: bool) -> None:
-        """The run is over."""
+        """Handle the end of the run."""
         if self._page is not None:
             last = self._state(session, session.done)
             self._page.status(last | {"state": "failed" if failed else "stopped"})
             self._page.poll()
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Take an event."""
+        """Handle an event."""
         if self._page is not None and (kind != "command" or (text := self._shown(text))):
             level = "alarm" if kind in ALARMS else "warning" if kind in WARNINGS else "info"
             self._page.event(level, time_s, text)
@@ -106,7 +106,7 @@ class PageObserver:
         return self._page.commands()
 
     def step(self, session: Session, step: int) -> None:
-        """A step is over."""
+        """Handle the end of a step."""
         if self._page is not None:
             active = ((label, fault.begin) for label, fault in session.active_faults())
             self._spans.observe(active, session.time_s)

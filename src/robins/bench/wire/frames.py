@@ -28,7 +28,7 @@ MOST_PAYLOAD = 4096
 
 
 class FrameError(RobinsError, ValueError):
-    """Bytes that are no frame; `why` is one of the names of `robins.bench.wire.receiver.Counts`."""
+    """Bytes that do not form a frame; `why` is a field of `robins.bench.wire.receiver.Counts`."""
 
     def __init__(self, why: str, text: str):
         super().__init__(text)

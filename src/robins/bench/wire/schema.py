@@ -46,7 +46,7 @@ NUMBERS = {m.name: m.number for m in PROTOCOL}
 
 
 class WireError(RobinsError, ValueError):
-    """A table of messages that no wire can carry."""
+    """Invalid table of messages."""
 
 
 class Wire:
@@ -121,7 +121,7 @@ class Wire:
         return self._record(name).decode(payload)
 
     def unsound(self, name: str, payload: bytes) -> PayloadFault | None:
-        """Reason why a payload contradicts the table of its message; None: it is sound.
+        """Reason why a payload contradicts the table of its message; None: it is valid.
 
         Raises:
             KeyError: there is no such message.

@@ -51,7 +51,7 @@ class LinearisedSensor(NamedTuple):
     size: Array  # (E, m) magnitude of the terms of the reading
 
     def seen_with(self, factor: Array, use: Array) -> Observation:
-        """Observation in one step (no axis E), the prior error having this covariance factor."""
+        """Observation in one step (no axis E) for a prior error with this covariance factor."""
         n = factor.shape[0]
         belief = Belief(jnp.zeros(n), factor)
         m = self.H.shape[0]

@@ -114,7 +114,7 @@ def scale_changes(scales: Sequence[float | int], up: float = UP, back: float = B
 
 @value
 class Adapted:
-    """Maker of a mode of `adaptive`, given its noise rule and its offset hypothesis, if any."""
+    """Factory of a mode of `adaptive`, from its noise rule and its offset hypothesis, if any."""
 
     way: Linearisation
     weight: Rule

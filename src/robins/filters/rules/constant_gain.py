@@ -27,7 +27,7 @@ class GainMemory(NamedTuple):
 
 @value
 class ConstantGain(Rule):
-    """Rule of `constant_gain`: `corrected` by the gains in the memory."""
+    """Rule of `constant_gain`: the update `corrected`, with the gains in the memory."""
 
     gains: dict[str, Numbers]  # (n, m) by sensor
 

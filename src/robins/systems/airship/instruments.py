@@ -108,7 +108,7 @@ class EarlySights(NamedTuple):
 
 
 def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
-    """Pitch, roll, heading."""
+    """Pitch, roll, heading [rad]."""
     return _angles(navigation(x).q_nb)
 
 
@@ -289,14 +289,14 @@ def printed_constraint(
 
 
 def _printed_sar(datum: Datum, x: Any, aux: Any):
-    """(45): the heading's row as printed."""
+    """Reading and Jacobian of (45), with the heading row as printed."""
     heading = _turned(x)[2]
     H = jnp.zeros((4, 9)).at[[0, 1, 3], [6, 7, 8]].set(jnp.array([1.0, 1.0, -1.0]))
     return read_sar(datum, x, aux), H.at[2, :3].set(heading)
 
 
 def _printed_euler(x: Any, aux: Any):
-    """(48)."""
+    """Reading and Jacobian of (48)."""
     return read_euler(x, aux), jnp.concatenate([_turned(x), jnp.zeros((3, 6))], 1)
 
 

@@ -174,7 +174,9 @@ class Airship(Scenario):
 
     @pydantic.model_validator(mode="after")
     def _rates_fit(self) -> Airship:
-        """All that is measured falls on epochs, or on even parts of one; all of it fits."""
+        """Check that all measurement times fall on epochs or on even parts of one, and that all of
+        it fits.
+        """
         refuse_too_long("imu.rate", self.duration, self.imu.rate)
         if self.wind.turbulence is not None:
             refuse_too_long("wind.turbulence.step", self.duration, 1.0 / self.wind.turbulence.step)

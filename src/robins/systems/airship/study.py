@@ -188,7 +188,7 @@ _AROUND_LOSS_S = (-1.0, 100.0, 200.0, 299.0, 350.0, 500.0)  # after the loss beg
 
 
 def view(given: Airship, course: AirshipCourse) -> View:
-    """Report of every filter."""
+    """Contents of the report of every filter."""
     # an epoch that ends a span belongs to it: 200 s to 800 s are the epochs 200.0 to 800.0
     first, last = (
         int(np.searchsorted(course.epoch_s, t))

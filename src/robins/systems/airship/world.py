@@ -209,7 +209,9 @@ def _between_sights(
     noise: Array,
     k: Array,
 ) -> tuple[Increments, Increments, Increments]:
-    """Increments from the k-th sight to the next: true as one, reported as parts and as one."""
+    """Increments from the k-th sight to the next: true ones joined, reported ones in parts and
+    joined.
+    """
     imu, n = given.imu, course.samples
     dt = jnp.full(n, 1.0 / imu.rate)
     time = (k * n + jnp.arange(n + 1)).astype(float) / imu.rate
@@ -292,6 +294,6 @@ def _turned_since(single: Increments) -> Array:
 
 
 def start_sigma(given: Airship) -> Numbers:
-    """(9,) of attitude, velocity and position."""
+    """Initial standard deviations (9,) of attitude, velocity and position."""
     s = given.start
     return as_array([*s.attitude, *s.velocity, *s.position])

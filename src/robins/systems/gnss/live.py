@@ -77,7 +77,7 @@ def predicted(filter_: Filter, model: Model, state: FilterState, u: MotionStep) 
 
 
 def kept(step: Step) -> WatchedStep:
-    """The same after the pseudoranges of an epoch, and their code, NIS and number."""
+    """Posterior as in `predicted`, then code, NIS and number of the pseudoranges of the epoch."""
     info = step.info[RANGES]
     outcome = [jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)]
     return WatchedStep.of(step, jnp.concatenate([_vector(step.posterior), jnp.stack(outcome)]))
@@ -91,7 +91,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 
 def answer_of(time_ns: int, place: LocalFrame, x: np.ndarray, flags: Flag) -> RoadNavigation:
-    """Answer of a vector of `predicted` or `kept`.
+    """Unpack a vector of `predicted` or `kept` into an answer.
 
     Args:
         time_ns: its stamp.
@@ -114,7 +114,7 @@ def answer_of(time_ns: int, place: LocalFrame, x: np.ndarray, flags: Flag) -> Ro
 
 
 class LiveGnss(Live):
-    """State of a road vehicle at each record, at once (see the module for what differs).
+    """Live state of a road vehicle at each record (the module lists differences from a replay).
 
     Attributes:
         counts: records refused by reason: `odometry_...`, `ranges_...` (epochs), `range_...`
@@ -139,7 +139,7 @@ class LiveGnss(Live):
         longest_delay_s: float = 1.0,
         machine: str | None = None,
     ):
-        """Make the programs, before the first record.
+        """Create the object, and build its programs before the first record.
 
         Args:
             parameters: as of a replay.
@@ -174,7 +174,7 @@ class LiveGnss(Live):
         self._compile()
 
     def _restart(self) -> None:
-        """Forget all but the counts and the stamps."""
+        """Reset all but the counts and the stamps."""
         given = self._made_with
         waits = given["wait_s"], given["longest_delay_s"]
         self._path = GnssPath(self.parameters, given["channels"], *waits)
@@ -191,7 +191,7 @@ class LiveGnss(Live):
         sigma_speed: float,
         sigma_yaw: float,
     ) -> RoadNavigation:
-        """Take a sample of wheels and yaw gyro; the state at its stamp.
+        """Process a sample of wheels and yaw gyro; return the state at its stamp.
 
         Args:
             time_ns: stamp, whole nanoseconds, of the clock that epochs have too.
@@ -226,7 +226,8 @@ class LiveGnss(Live):
         elevation_rad: ArrayLike,
         cn0_dbhz: ArrayLike,
     ) -> RoadNavigation:
-        """Take the pseudoranges of an epoch, late or not; the state at the newest odometry.
+        """Process the pseudoranges of an epoch, late or not; return the state at the newest
+        odometry.
 
         Args:
             time_ns: of the receiver, whole nanoseconds.
@@ -275,7 +276,7 @@ class LiveGnss(Live):
         return self._answer(Flag(0))
 
     def _refused(self, time_ns: int) -> str:
-        """Reason why an epoch is refused; "" for one that is taken."""
+        """Reason for refusing an epoch; "" if it is accepted."""
         last_ns = self._path.time_ns
         if last_ns is not None and time_ns <= last_ns:
             return "too_old"
@@ -285,7 +286,7 @@ class LiveGnss(Live):
         return "ahead" if newest_ns is not None and time_ns > newest_ns + _GAP_S * 1e9 else ""
 
     def _advance(self) -> None:
-        """Take all steps that can be taken."""
+        """Make all filter steps that the records allow."""
         dropped, without_fix = self._path.dropped, self._path.without_fix
         for time_ns, world in self._path.steps():
             if self._online is None:
@@ -338,7 +339,7 @@ class LiveGnss(Live):
         return answer._replace(code=self.epoch.code, nis=self.epoch.nis, dof=self.epoch.dof)
 
     def _compile(self) -> None:
-        """Have all compiled by a standstill that is thrown away."""
+        """Compile all programs by running through a standstill, which is discarded."""
         letters = [name for name, n in self._made_with["channels"].items() for _ in range(n)]
         z = 1.0 - (2.0 * np.arange(len(letters)) + 1.0) / len(letters)
         turns = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(letters))

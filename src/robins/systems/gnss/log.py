@@ -38,7 +38,7 @@ CAUSES = (
 
 
 def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPath]:
-    """Every satellite in a column of its own, every time of the receiver an epoch.
+    """Arrange a log with a column for each satellite and an epoch for each receiver time.
 
     The first epoch is the first with odometry and pseudoranges of four satellites; the filter
     starts there, and uses them after a first step of zero duration.
@@ -89,7 +89,7 @@ def names_of(ranges: RangeTable) -> list[str]:
 
 
 def _letter(system: int) -> str:
-    """Letter of a system; a small one of its own where it has no name."""
+    """Letter of a system; an unused lower-case one if it has no name."""
     return LETTERS.get(system, chr(ord("a") + system % 26))
 
 
@@ -177,7 +177,7 @@ def replay(
 
 
 def truth_at(truth: PlaceTable, place: LocalFrame, time_ns: np.ndarray) -> np.ndarray:
-    """(E, 3) true places [m, NED] at the epochs, by straight lines; NaN beyond the truth."""
+    """(E, 3) true positions [m, NED] at the epochs, interpolated; NaN outside the truth."""
     local = np.asarray(place.local(truth.r_e))
     t, epochs = (x - time_ns[0] for x in (truth.time_ns, time_ns))
     out = np.stack([np.interp(epochs, t, x) for x in local.T], axis=1)

@@ -1,4 +1,4 @@
-"""Path from odometry and pseudoranges to steps of the filter, chunk by chunk.
+"""Conversion of odometry and pseudoranges to filter steps, chunk by chunk.
 
 A replay is one chunk, a live object chunks of one; any chunks of the same records give the same
 bits. Each time of the receiver is an epoch, and each satellite has a column, free again when
@@ -38,7 +38,7 @@ _fix = jax.jit(first_fix)
 
 
 class GnssPath:
-    """Odometry and pseudoranges to steps of the filter (see the module).
+    """Converter of odometry and pseudoranges to steps of the filter (see the module).
 
     Attributes:
         satellites: name in each column, "" where there was none yet.
@@ -58,7 +58,7 @@ class GnssPath:
         wait_s: float = 0.0,
         timeout_s: float = math.inf,
     ):
-        """Make a path without records.
+        """Create a converter without records.
 
         Args:
             believed: of wheels, delays and clocks.
@@ -89,7 +89,7 @@ class GnssPath:
         self._satellite_e = np.tile([_FAR_M, 0.0, 0.0], (count, 1))  # where it was last
 
     def push_odometry(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
-        """Take odometry.
+        """Add odometry.
 
         Args:
             time_ns: (M,) int64, rising.
@@ -99,7 +99,7 @@ class GnssPath:
         self._odometry = np.concatenate([self._odometry, rows])
 
     def push_ranges(self, time_ns: int, names: list[str], rows: np.ndarray) -> None:
-        """Take the pseudoranges of an epoch, later than that of the last step.
+        """Add the pseudoranges of an epoch later than that of the last step.
 
         Args:
             time_ns: of the receiver.
@@ -120,7 +120,7 @@ class GnssPath:
         del self._waiting[0]
 
     def steps(self) -> list[tuple[int, GnssWorld]]:
-        """Time [ns] and world, without a leading axis, of each step that can be taken now.
+        """Time [ns] and world, without a leading axis, of each step that can be made now.
 
         The first is to the first epoch with a fix of four satellites while there is odometry; it
         has no length.
@@ -136,7 +136,7 @@ class GnssPath:
         return out
 
     def _due(self) -> tuple[int, list[str], np.ndarray] | None:
-        """Next epoch, or end of a step without one; None: the odometry has not come that far."""
+        """Next epoch, or end of a step without one; None: the odometry does not reach it yet."""
         if (newest_ns := self.newest_ns) is None:
             return None
         first_ns = self._waiting[0][0] if self._waiting else math.inf
@@ -192,7 +192,7 @@ class GnssPath:
         return GnssWorld(self.fix, self._with_delays(u, fresh), {RANGES: y, LENGTH: length}, sky)
 
     def _travel(self, until_ns: int) -> tuple[MotionStep, float]:
-        """Step from the last one to a time, without delays, and the length of the way [m].
+        """Step from the last one to a time, without delays, and the distance travelled [m].
 
         Speed and yaw rate are straight lines between their samples; a step has their means.
         """
@@ -235,7 +235,7 @@ class GnssPath:
         return y, Sky(self._satellite_e.copy(), sigma), fresh
 
     def _column(self, name: str) -> int | None:
-        """Column of a satellite; for a new one that which was not in use for longest."""
+        """Column of a satellite; a new one gets the column that has been unused for longest."""
         if name in self.satellites:
             return self.satellites.index(name)
         of = [k for k, letter in enumerate(self._letters) if name.startswith(letter)]

@@ -74,7 +74,7 @@ HEAVIEST = 16.0  # largest factor on the covariance of a position, by its weight
 
 
 class AugmentedInsState(NamedTuple):
-    """Navigation state, with unknown properties of the receiver."""
+    """Navigation state augmented by unknown errors of the receiver."""
 
     ins: InsState
     lasting: Array | None  # (3,) NED, of unit variance; None where errors of positions are white

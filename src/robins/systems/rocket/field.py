@@ -145,7 +145,7 @@ def observed(x: FieldState, field_n: Array):
 
 # (B5)
 def field_noise(sine: Array, x: FieldState, field_n: Array) -> Array:
-    """(3,) standard deviations: an angle, so in proportion to the field."""
+    """(3,) standard deviations, proportional to the field, since the error is an angle."""
     return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 
 

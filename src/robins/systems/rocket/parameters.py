@@ -57,7 +57,7 @@ class RocketGyro(Parameters):
 
 
 class MagneticDisturbance(Parameters):
-    """The magnetometer is wrong by an angle, for a while, again and again."""
+    """Recurring disturbance of the magnetometer by an angle, each for a limited time."""
 
     angle: q.Spread
     every: q.Duration = default("30 s")

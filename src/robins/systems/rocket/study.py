@@ -112,7 +112,7 @@ def bank(driver: str, *off: str) -> Filter:
 
 
 class AngleFilter(NamedTuple):
-    """A filter of "magnetic-attitude"."""
+    """Definition of a filter of the study "magnetic-attitude"."""
 
     sharing: Sharing | None = None  # between two local filters; None: a single filter
     rule: Rule | None = None
@@ -231,7 +231,7 @@ def angle_contender(given: MagneticAttitude, course: RocketCourse, name: str) ->
 
 
 class FieldFilter(NamedTuple):
-    """A filter of "field-vector"."""
+    """Definition of a filter of the study "field-vector"."""
 
     filter: Filter = ukf()
     sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field without a motion model

@@ -51,14 +51,14 @@ class SatelliteCourse(NamedTuple):
 
 
 def inertia(craft: Craft) -> np.ndarray:
-    """(3, 3) kg m^2."""
+    """Inertia matrix (3, 3) [kg m^2], body axes."""
     xy, xz, yz = craft.products
     off = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
     return np.diag(craft.moments) + off
 
 
 def wheel_axes(wheels: ReactionWheels) -> np.ndarray:
-    """(3, W) unit columns."""
+    """Wheel axes (3, W) as unit columns, body axes."""
     axes = np.array(wheels.axes, float).T.reshape(3, len(wheels.axes))
     return axes / np.linalg.norm(axes, axis=0)
 

@@ -153,7 +153,7 @@ _shows = jax.jit(partial(compiled_alone, _sky))
 def _sensor(
     given: LoopConstants, vectors_s, magnitude, looks_q_ib, before, row: StepInputs
 ) -> StarFrame:
-    """Frame of the star sensor from the stars that it is shown; as `nodes.star`."""
+    """Star sensor frame from the simulated stars; see `nodes.star`."""
     assert given.lens is not None
     solves = partial(_solves, given.lens, given.star_key)
     seen, number = row.course.star.seen, row.course.number

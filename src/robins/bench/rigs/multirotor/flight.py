@@ -51,7 +51,7 @@ class Multirotor(Parameters):
 
 
 class MultirotorConfig(NamedTuple):
-    """The numbers of a run."""
+    """Configuration of a run."""
 
     step_ns: int
     given: Multirotor

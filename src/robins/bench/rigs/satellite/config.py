@@ -70,7 +70,7 @@ class SatelliteConfig(NamedTuple):
 
     @property
     def frames(self) -> tuple[int, int]:
-        """A step without a star frame, if there is one, and one with."""
+        """Numbers of a step without a star frame, if there is one, and of a step with one."""
         return int(np.argmin(self.due)), int(np.argmax(self.due))
 
 

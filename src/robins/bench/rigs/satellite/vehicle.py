@@ -106,7 +106,7 @@ def _turn_on(given: RateTable, state: TableState, dt_s: Array):
 
 
 def table(config: SatelliteConfig) -> Part:
-    """The rate table: it turns its sensors with the craft, exactly or with a lag."""
+    """Rate table that turns the gyro with the craft, exactly or with a lag."""
     first = np.asarray(config.vehicle.craft.q_ib)
     rate = rate_b(config.given.craft, config.vehicle.craft)
     dt = jnp.asarray(config.step_ns * 1e-9)
@@ -162,7 +162,7 @@ _expected = jax.jit(nodes.expected_attitude)
 
 
 def gyro(config: SatelliteConfig) -> Part:
-    """The gyro triad: it reports the turn since its last sample, in whole counts."""
+    """Gyro triad: reports the rotation since its last sample, in whole counts."""
     reads = driven(config, nodes.gyro)
     first = (jnp.asarray(config.vehicle.craft.q_ib), config.vehicle.residue)
 

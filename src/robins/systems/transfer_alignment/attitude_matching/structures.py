@@ -44,7 +44,7 @@ START = Flexure(np.full(3, 10.0 * _ARCMIN), np.full(3, 1.0))
 
 
 class StructureHypothesis(NamedTuple):
-    """A structure."""
+    """Hypothesis about the structure: its flexure and flutter."""
 
     sigma: ArrayLike  # rad, of the flexure; 0: stiff
     time: ArrayLike  # s, its time constant

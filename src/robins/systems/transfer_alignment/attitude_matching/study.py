@@ -194,7 +194,7 @@ def _existing(step: Step):
 
 
 def view(given: AttitudeMatching, course: MatchingCourse) -> View:
-    """Report of every filter."""
+    """Contents of the report of every filter."""
     roll, count = am.roll_rad(given.manoeuvre, course.epoch_s), len(course.epoch_s)
     return View(
         epoch_s=course.epoch_s,

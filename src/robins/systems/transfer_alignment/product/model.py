@@ -103,7 +103,7 @@ _ProductNoise = tuple[InsNoise, Flexure | None]  # of the slave and of its mount
 
 
 def _swing(flexure: Flexure, block: ImuBlock) -> tuple[Array, Array]:
-    """(2) over a block: Phi (6, 6) of (l, l'), and a factor (6, 6) of Q."""
+    """Flexure over a block by (2): Phi (6, 6) of (l, l'), and a factor (6, 6) of Q."""
     return swing(flexure, jnp.sum(jnp.asarray(block.increments.dt)))
 
 
@@ -117,7 +117,7 @@ def _step(drive: _ProductNoise, x: ProductState, block: ImuBlock) -> ProductStat
 
 
 def _step_linear(drive: _ProductNoise, x: ProductState, block: ImuBlock):
-    """(1): the state after a block of samples, Phi and a factor of Q."""
+    """State after a block of samples by (1), Phi and a factor of Q."""
     noise, flexure = drive
     ins, Phi, L = propagate_linear(x.ins, block.increments, noise, segments=1)
     new = x._replace(ins=ins)
@@ -213,7 +213,7 @@ def _linear_attitude(at: Installation, x: ProductState, lag: RecordDelay):
 
 
 def _linear_velocity(at: Installation, x: ProductState, lag: RecordDelay):
-    """(5) and its Jacobian, (12) where the delay is zero."""
+    """Predicted velocity (5) and its Jacobian, (12) where the delay is zero."""
     then = _then(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
     free = frame_dynamics(x.ins)

@@ -1,4 +1,4 @@
-"""Path from a slave's increments and a master's records to steps of the filter, chunk by chunk.
+"""Conversion of a slave's increments and a master's records to filter steps, chunk by chunk.
 
 A replay is one chunk, a live object chunks of one; any chunks give the same bits. Taken from the
 future are an increment after an epoch, which shows whether a long interval is a gap, and the gyros
@@ -35,7 +35,7 @@ PairSteps = tuple[ImuBlock, Nav, RecordDelay]
 
 
 class PairPath:
-    """Increments and records to steps of the filter (see the module).
+    """Converter of increments and records to steps of the filter (see the module).
 
     Attributes:
         imu: increments of samples that come in chunks; their clock begins with the first one.
@@ -43,7 +43,7 @@ class PairPath:
     """
 
     def __init__(self, parameters: PairReplay, usual_s: float):
-        """Create a path without samples, of a slave with this sampling interval [s]."""
+        """Create a converter without samples, for a slave with this sampling interval [s]."""
         self._parameters, self._usual_s = parameters, usual_s
         self._delay_s, self._half_s = parameters.master.delay, max(0.01, usual_s)
         self.imu = IncrementStream(usual_s)
@@ -62,7 +62,7 @@ class PairPath:
         self.records = both[np.argsort(both[:, 0], kind="stable")]
 
     def end(self) -> None:
-        """State that no increment follows: the rest becomes steps, up to the last increment."""
+        """Declare the increments complete: the rest becomes steps, up to the last increment."""
         self._ended = True
 
     @property

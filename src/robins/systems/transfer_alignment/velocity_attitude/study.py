@@ -305,7 +305,7 @@ def _of_pair(case: Callable[[product.PairRun], Case], world: VelocityAttitudeWor
 
 
 def view(given: VelocityAttitude, course: VelocityAttitudeCourse) -> View:
-    """Report of every filter, errors being true minus estimated."""
+    """Contents of the report of every filter; errors are true minus estimated."""
     epoch_s, path = course.pair.epoch_s, course.pair.path
     roll, _, heading = (np.asarray(a) for a in to_euler(jnp.asarray(path.q_nb.wxyz)))
     return View(
