@@ -12,7 +12,7 @@ from robins.bench.broker import LinkLost
 from robins.errors import RobinsError
 from robins.logs import LogError
 from robins.results import ResultError
-from robins.results.errors import cannot
+from robins.results.errors import result_error
 from robins.scenario import ScenarioError
 from robins.workbench import InputError
 
@@ -71,6 +71,6 @@ def test_an_error_is_one_sentence_of_its_parts(error, where, what, fix, sentence
 def test_a_failing_disk_is_not_bad_input():
     assert RobinsError("x").bad_input
     assert ResultError("out", "x", "y").bad_input
-    assert not cannot("out", "write", OSError(28, "full")).bad_input
-    assert cannot("out", "write", ValueError("a name")).bad_input
+    assert not result_error("out", "write", OSError(28, "full")).bad_input
+    assert result_error("out", "write", ValueError("a name")).bad_input
     assert not LinkLost("adm", OSError(5, "gone")).bad_input

@@ -257,7 +257,7 @@ def answers(
     with np.errstate(all="ignore"):
         far = np.abs(mean - rows["X"]) / sigma
     far = np.max(np.median(far[:, -STEPS // 10 :], axis=1), axis=-1)
-    looks = tally.looking(info, rows["y"])
+    looks = tally.with_innovations(info, rows["y"])
     each = [jax.tree_util.tree_map(lambda x, i=i: x[i], looks) for i in range(len(far))]
     return np.nan_to_num(far, nan=np.inf), [doubts(t, bounds, assumed) for t in each]
 

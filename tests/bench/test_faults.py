@@ -24,7 +24,7 @@ from robins.scenario import Parameters, ScenarioError, parse
 from robins.systems.satellite import nodes
 from robins.systems.satellite.nodes import NoiseFreeInputs
 from robins.systems.satellite.parameters import StarSensor
-from robins.systems.satellite.world import _star_says
+from robins.systems.satellite.world import _star_sensor_faults
 
 S = 10**9
 injecting = partial(Injector, RIG.table)
@@ -450,7 +450,7 @@ def test_the_star_sensor_lies_as_in_one_program():
     lost = (7.0, 8.0), (13.5, 15.0), (16.5, 17.5)
     times = np.arange(1, 201) * 0.1
     due = np.arange(1, 201) % 5 == 0
-    says = _star_says(
+    says = _star_sensor_faults(
         StarSensor.model_validate(
             {
                 "faults": tuple({"kind": k, "begin": b, "end": e} for k, b, e in spans),

@@ -161,7 +161,9 @@ def test_a_run_shown_alone_is_that_of_the_campaign(undisturbed, run):
     whole = gather(store, plan, problem).found
     shown = campaign_show(undisturbed, run)
     assert shown.runs == 1
-    again = Worker(store, plan, problem).runs_of(plan.chunk_of(run), list(plan.filters), [run])
+    again = Worker(store, plan, problem).run_statistics(
+        plan.chunk_of(run), list(plan.filters), [run]
+    )
     for name, (one,) in ((name, of.values()) for name, of in again.items()):
         np.testing.assert_array_equal(one.run_rms[0], whole[name].run_rms[run])
         first = one.first_run["error"]
@@ -181,7 +183,10 @@ def test_a_run_in_lanes_is_that_of_the_campaign(tmp_path, monkeypatch):
     list(worker.work())
     whole = gather(store, plan, problem).found["kf"]
     chunks = list(plan.chunks)
-    alone = {run: worker.runs_of(chunks[run // 8], ["kf"], [run])["kf"][run] for run in (0, 13, 20)}
+    alone = {
+        run: worker.run_statistics(chunks[run // 8], ["kf"], [run])["kf"][run]
+        for run in (0, 13, 20)
+    }
     for run, one in alone.items():
         np.testing.assert_array_equal(one.run_rms[0], whole.run_rms[run])
     again = Worker(store, plan, problem).found(chunks[1], ["kf"])["kf"]

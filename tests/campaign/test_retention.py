@@ -96,14 +96,14 @@ def test_which_diverged_runs_are_kept_does_not_depend_on_the_order(tmp_path, kep
 
 def test_kept_runs_are_shown_without_computing_them_again(plain, kept, monkeypatch):
     one = campaign_show(plain, 21)
-    again = Worker.runs_of
+    again = Worker.run_statistics
     computed = []
 
     def watched(self, chunk, names, runs):
         computed.append(runs)
         return again(self, chunk, names, runs)
 
-    monkeypatch.setattr(Worker, "runs_of", watched)
+    monkeypatch.setattr(Worker, "run_statistics", watched)
     mine = campaign_show(kept, 21)
     assert plain_of(mine.metrics) == plain_of(one.metrics)
     assert set(mine.solution.variables) == set(one.solution.variables)

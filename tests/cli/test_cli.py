@@ -16,7 +16,7 @@ from robins import cli, report, results
 from robins.bench.rigs import RIGS
 from robins.cli import ExitStatus, cache, running
 from robins.logs import Finding, LogError
-from robins.results.errors import cannot
+from robins.results.errors import result_error
 from robins.scenario import ScenarioError
 from robins.units import UnitError
 
@@ -157,7 +157,7 @@ def test_what_nobody_reads_is_written_all_the_same(robins, workbench, monkeypatc
 
 
 REFUSED = results.ResultError("out", "is a file, not a folder", "choose a new folder")
-FULL_DISK = cannot("out", "write", OSError(28, "No space left on device"))
+FULL_DISK = result_error("out", "write", OSError(28, "No space left on device"))
 
 
 @pytest.mark.parametrize(

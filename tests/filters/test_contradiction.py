@@ -55,7 +55,7 @@ def test_an_exact_component_that_cannot_be_is_said(factor, H, W, y, code):
     # What is not contradicted is used all the same.
     met = np.asarray(info.used) & ~np.any(W, axis=1)
     np.testing.assert_allclose((H @ state.belief.mean)[met], np.array(y)[met])
-    tally = Tally.blank(("y",)).and_step(jnp.asarray(0), {"y": info})
+    tally = Tally.blank(("y",)).add_step(jnp.asarray(0), {"y": info})
     assert np.isinf(tally.nis["y"]) == (code != Code.DONE)
     verdict = grand_mean_nis(np.array([1.0, info.nis]), np.array([1, info.dof]))
     assert np.isinf(verdict.value) == (code != Code.DONE)

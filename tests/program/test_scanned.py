@@ -144,7 +144,7 @@ def test_a_run_by_the_interpreter_is_the_run_by_jax():
 def test_a_state_steps_without_tracing_once_the_cache_knows_its_program(monkeypatch):
     def stepped():
         monkeypatch.setattr("robins.program.memory._known", OrderedDict())
-        memory = NativeState(np.array([1.0, 2.0]), "adder", lasting=True)
+        memory = NativeState(np.array([1.0, 2.0]), "adder", persistent=True)
         told = memory.step(
             "add", lambda s, u: (s + u, Belief(s * u, (s - u)[None])), np.array([3.0, 0.5])
         )

@@ -240,7 +240,7 @@ def test_the_flight_is_turned_and_shifted_to_what_the_master_reports():
     e = np.array([0.02, -0.03, 0.05, 1.0, -2.0, 0.0, 30.0, 20.0, 0.0])
     truth, flown = navigate(va.start_with_error(start, np.zeros(9)), blocks)
     wrong, astray = navigate(va.start_with_error(start, e), blocks)
-    flight, C_nb = va.as_master_sees(wrong, astray, truth)
+    flight, C_nb = va.corrected_by_master(wrong, astray, truth)
     assert_allclose(C_nb, va.dcm_enu(truth.q_nb.wxyz), rtol=0, atol=1e-12)
     # within an interval the difference hardly moves
     assert_allclose(flight.C_nb, flown.C_nb, rtol=0, atol=1e-5)
@@ -249,7 +249,7 @@ def test_the_flight_is_turned_and_shifted_to_what_the_master_reports():
     assert_allclose(flight.lat_rad, flown.lat_rad, rtol=0, atol=1e-7)
 
     silent = jax.tree.map(lambda a: a.at[3].set(jnp.nan), truth)
-    flight, C_nb = va.as_master_sees(wrong, astray, silent)
+    flight, C_nb = va.corrected_by_master(wrong, astray, silent)
     assert_allclose(C_nb[3], va.dcm_enu(wrong.q_nb.wxyz)[3], rtol=0, atol=0)
     assert_allclose(flight.f_enu[3], astray.f_enu[3], rtol=0, atol=0)
     assert_allclose(flight.v_enu[3], astray.v_enu[3], rtol=0, atol=0)

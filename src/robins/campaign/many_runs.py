@@ -58,7 +58,7 @@ class ManyRuns:
         """
         runs = len(jax.tree_util.tree_leaves(arrays)[0])
         require(len(points) > 0 and runs > 0, "there must be points and runs", (len(points), runs))
-        numbers = self._that_differ(points)
+        numbers = self._varying_leaves(points)
         staged = self._staged
         if staged is None:
             staged = self._staged = self._traced(points[0], numbers, arrays)
@@ -78,7 +78,7 @@ class ManyRuns:
         refused = [*self._refused, *map(str, self._staged.refused if self._staged else [])]
         return [f"a part stays with JAX, as {why}" for why in dict.fromkeys(refused)]
 
-    def _that_differ(self, points: Sequence[Tree]) -> dict[int, np.ndarray]:
+    def _varying_leaves(self, points: Sequence[Tree]) -> dict[int, np.ndarray]:
         """The leaves that are arguments, by number, each with a leading axis of points."""
         leaves = list(map(jax.tree_util.tree_leaves, points))
         self._first = self._first or leaves[0]

@@ -100,7 +100,11 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
         counts=_counts(found),
         notes=[
             *problem.notes,
-            *(sentence for name, s in found.items() for sentence in _finds(problem, name, s)),
+            *(
+                sentence
+                for name, s in found.items()
+                for sentence in _fault_sentences(problem, name, s)
+            ),
             *(_undecided(c["id"], c["more_runs"]) for c in claims if c["verdict"] == "undecided"),
         ],
         warnings=[
@@ -111,7 +115,7 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
     )
 
 
-def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
+def _fault_sentences(problem: Problem, name: str, s: Statistics) -> list[str]:
     """Sentences on the instruments that a filter finds faulty, with the time of the first alarm."""
     if s.runs == 1:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
@@ -263,7 +267,7 @@ def campaign_solution(
         if o.is_error:
             rms = _stack(found, lambda s, name=o.name: s.output_rms(name))
             data |= block_array("rms", o, rms, f"RMS {words}", comment=o.text, runs=runs)
-    data |= _notes(found) | _wrong(problem, found)
+    data |= _notes(found) | _fault_probabilities(problem, found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     seen = [s.first_run["updates"] for s in found.values()]
     return xr.Dataset(data | innovation_tables(seen, problem.sensors, problem.epoch_s))
@@ -284,7 +288,7 @@ def _scatter(b: StateBlock, found: dict[str, Statistics]) -> Variables:
     )
 
 
-def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Variable]:
+def _fault_probabilities(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Variable]:
     """Fault probability of each suspect, in the first run and over all runs, and the truth."""
     data = tables("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
     if not data:

@@ -96,7 +96,7 @@ class Statistics:
             worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
             self._each("peaks", np.stack(worst, axis=1))
         if "tally" in record:
-            tally = record["tally"].looking(record["updates"], record.get("readings"))
+            tally = record["tally"].with_innovations(record["updates"], record.get("readings"))
             for name, value in _by_name(tally).items():
                 self._each(name, value)
 

@@ -103,7 +103,7 @@ class Worker:
 
         return self.machine.compute(chunk, self.plan.width, names, taken, self._left)
 
-    def runs_of(
+    def run_statistics(
         self, chunk: Chunk, names: list[str], runs: Sequence[int]
     ) -> dict[str, dict[int, Statistics]]:
         """Statistics of some runs of a chunk by filter, each alone with its histories.
@@ -137,7 +137,9 @@ class Worker:
         group = dict.fromkeys(lost, DIVERGED) | group
         if not group:
             return
-        for run, one in self.runs_of(chunk, [shard.filter], list(group))[shard.filter].items():
+        for run, one in self.run_statistics(chunk, [shard.filter], list(group))[
+            shard.filter
+        ].items():
             self.store.put(name_of(group[run], shard, run), self.packed(shard, chunk, one))
         if lost and most is not None:
             trim(self.store, self._stems, shard.filter, most)

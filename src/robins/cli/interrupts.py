@@ -21,7 +21,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 _asked = False
 
 
-def _is_deaf(frame: FrameType | None) -> bool:
+def _swallows_interrupts(frame: FrameType | None) -> bool:
     while frame is not None:
         if frame.f_code.co_name in _DEAF:
             return True
@@ -32,7 +32,7 @@ def _is_deaf(frame: FrameType | None) -> bool:
 def _interrupt(_number: int, frame: FrameType | None) -> None:
     global _asked
     _asked = True
-    if _is_deaf(frame):
+    if _swallows_interrupts(frame):
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # try again a little later
         return
     raise KeyboardInterrupt

@@ -35,7 +35,7 @@ _TABLE = (
 )
 
 
-def _fall(base: tuple[float, float, float], geopotential_m: float) -> float:
+def _pressure_ratio(base: tuple[float, float, float], geopotential_m: float) -> float:
     """P / P_b at a geopotential height in the layer that begins at a base (H_b, T_b, L)."""
     base_m, base_k, lapse = base
     if lapse == 0.0:
@@ -47,7 +47,7 @@ def _fall(base: tuple[float, float, float], geopotential_m: float) -> float:
 def _base_pressures() -> tuple[float, ...]:
     found = [P0_PA]
     for below, above in itertools.pairwise(_TABLE):
-        found.append(found[-1] * _fall(below, above[0]))
+        found.append(found[-1] * _pressure_ratio(below, above[0]))
     return tuple(found)
 
 
@@ -79,7 +79,7 @@ def pressure_Pa(alt_m: float) -> float:
         ValueError: the height is beyond the standard's tables, -5 km to 86 km, or NaN.
     """
     at, geopotential_m = _layer(alt_m)
-    return _PRESSURES_PA[at] * _fall(_TABLE[at], geopotential_m)
+    return _PRESSURES_PA[at] * _pressure_ratio(_TABLE[at], geopotential_m)
 
 
 def pressure_altitude_m(pressure: float) -> float:

@@ -151,7 +151,7 @@ class StarIndex(NamedTuple):
     reach_rad: Any  # () each list is complete to this angle from any direction in its cell
 
 
-def refuse_other_lengths(unit_i: np.ndarray) -> None:
+def refuse_non_unit(unit_i: np.ndarray) -> None:
     """Refuse directions (N, 3) that are not unit vectors.
 
     Raises:
@@ -177,7 +177,7 @@ def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
     unit = np.asarray(stars.unit_i, float)
     if unit.ndim != 2 or unit.shape[1] != 3 or not len(unit):
         raise ValueError(f"unit_i must have shape (N, 3), N at least one, got {unit.shape}")
-    refuse_other_lengths(unit)
+    refuse_non_unit(unit)
     order = np.argsort(stars.magnitude, kind="stable")
     unit = unit[order]
 

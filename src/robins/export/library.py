@@ -214,7 +214,7 @@ class Library(NamedTuple):
         return [f"/* {about} */", "enum {", *codes, "};", ""]
 
     def _head(self) -> list[str]:
-        about = (f" * {_within(line)}".rstrip() for line in self.about)
+        about = (f" * {_comment_safe(line)}".rstrip() for line in self.about)
         return ["/*", *about, " */"] if self.about else []
 
     # -------------------------------------------------------------------------------- the file
@@ -274,12 +274,12 @@ def _declared(text: str, note: str) -> list[str]:
     """A field and its note: behind it where there is room, else before it."""
     if not note:
         return [text]
-    comment = f"/* {_within(note)} */"
+    comment = f"/* {_comment_safe(note)} */"
     both = f"{text} {comment}"
     return [both] if len(both) <= COLUMNS else [f"    {comment}", text]
 
 
-def _within(comment: str) -> str:
+def _comment_safe(comment: str) -> str:
     """Text made safe for a C comment: it neither ends the comment nor begins another."""
     return comment.replace("*/", "* /").replace("/*", "/ *")
 

@@ -56,7 +56,9 @@ class Loop(NamedTuple):
     due: Mapping[str, ArrayLike] = {}
 
 
-def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
+def _no_measurement(
+    filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data
+) -> Updated:
     """Unchanged state, and the information of an update without a measurement."""
     like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
     blank = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -79,19 +81,19 @@ def _scan(
         row, due = given
         world, reading = loop.react(world, state.belief, row)
         check_names(model, reading.y)
-        state, prediction = _apart(filter_.predict, state, model.motion, reading.u)
+        state, prediction = _unfused(filter_.predict, state, model.motion, reading.u)
         info = {}
         for sensor in model.sensors:
             if sensor.name in reading.y:
                 args = (state, reading.y[sensor.name], reading.aux.get(sensor.name))
                 taken = partial(_update, filter_, sensor)
                 if sensor.name in due:
-                    spared = partial(_without, filter_, sensor)
+                    spared = partial(_no_measurement, filter_, sensor)
                     state, info[sensor.name] = jax.lax.cond(due[sensor.name], taken, spared, *args)
                 else:
                     state, info[sensor.name] = taken(*args)
         step = Step(prediction, state.belief, info)
-        return (state, world, tally.and_step(prediction.code, info)), (keep(step), reading)
+        return (state, world, tally.add_step(prediction.code, info)), (keep(step), reading)
 
     (state, world, tally), (steps, readings) = jax.lax.scan(
         body, (state, loop.world, Tally.blank(tuple(model.dims))), (loop.rows, dict(loop.due))
@@ -100,10 +102,10 @@ def _scan(
 
 
 def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
-    return _apart(filter_.update, state, sensor, y, aux)
+    return _unfused(filter_.update, state, sensor, y, aux)
 
 
-def _apart(step: Callable[..., T], *args: Data) -> T:
+def _unfused(step: Callable[..., T], *args: Data) -> T:
     """Call a step of the filter without fusing it with the world, as `OnlineFilter` compiles it.
 
     The results are then bit-identical to those of separate programs for filter and world.
@@ -154,6 +156,6 @@ def run_closed(
 
     report_run(filter_, state, closed.final, closed.tally, again, time_s)
     if keep is everything and is_known(closed.tally):
-        tally = closed.tally.looking(closed.steps.info, closed.readings.y)
+        tally = closed.tally.with_innovations(closed.steps.info, closed.readings.y)
         closed = closed._replace(tally=tally)
     return closed

@@ -189,7 +189,7 @@ class Composite(Filter):
 
 
 @value
-class Around(Composite):
+class FilterWrapper(Composite):
     """Wrapper of a filter, `inner`; it has the state of `inner` unless it defines its own."""
 
     inner: Filter
@@ -231,7 +231,7 @@ def _outcome(o: Observation) -> Array:
     return jnp.where(jnp.all(o.accepted), int(Code.DONE), some)
 
 
-def _aside(sound: Array, S_y: Array) -> Array:
+def _safe_factor(sound: Array, S_y: Array) -> Array:
     """Factor S_y, or the identity where it is invalid: dividing by NaN would make all gradients
     NaN.
     """
@@ -251,7 +251,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
         sound = finite(S_y * S_y)  # where a square overflows, the other blocks are meaningless
-        S_y, cross = _aside(sound, S_y), jnp.where(sound, cross, 0.0)
+        S_y, cross = _safe_factor(sound, S_y), jnp.where(sound, cross, 0.0)
         S_post = jnp.tril(jnp.where(sound, S_post, jnp.nan))  # constant zeros above, for C code
         # After an exact measurement no variance is left in its direction. Rounding is set to zero,
         # since later updates would take it for variance.
@@ -265,7 +265,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
             P_y = P_y - deficit[:, None] @ deficit[None, :]
         S_y = linalg.cholesky(P_y)
         sound = finite(S_y)
-        S_y = _aside(sound, S_y)
+        S_y = _safe_factor(sound, S_y)
         cross = linalg.solve_lower(S_y, spread @ S.T).T
         K = linalg.solve_lower_transposed(S_y, cross.T).T
         # [S - K spread, -K excess, -K noise] is a factor of (I - K H) P (I - K H)' + K R K'.
@@ -320,7 +320,7 @@ def _named(given: Any) -> str:
     return getattr(given, "__name__", None) or repr(given)
 
 
-def _as_way(given: Any) -> Linearisation:
+def _as_linearisation(given: Any) -> Linearisation:
     if given is None:
         return taylor()
     if not isinstance(given, Linearisation):
@@ -459,4 +459,4 @@ def kalman(
         ValueError: the form is neither "sqrt" nor "joseph".
     """
     one_of("form", form, Form)
-    return Kalman(_as_way(linearise), _as_rules(rules), form)
+    return Kalman(_as_linearisation(linearise), _as_rules(rules), form)

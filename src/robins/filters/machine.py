@@ -192,4 +192,6 @@ def on(
     else:
         interpreter_of_one()
         engine = interpreted_step
-    return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine, lasting=True))
+    return ProgramStepper(
+        filter_, model, state, partial(NativeState, engine=engine, persistent=True)
+    )

@@ -161,7 +161,7 @@ class OnlineFilter:
             tally.updates[sensor] = np.bincount(code, minlength=len(Code))
             tally.nis[sensor] = np.sum(np.where(judged, info[sensor].nis, 0.0))
             tally.dof[sensor] = np.sum(np.where(judged, dof, 0))
-        return doubts(tally.looking(info, readings), bounds, assumed)
+        return doubts(tally.with_innovations(info, readings), bounds, assumed)
 
     def forget(self, steps: int) -> None:
         """Let the last steps, from which the caller goes back, not count for `doubts`."""

@@ -137,7 +137,7 @@ def _body(filter_: Filter, model: Model, keep: Keep, carry: Carry, row: Rows) ->
     gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
     moved = step.prediction.code == int(Code.DONE)
     total = total + jnp.where(moved, gained, -jnp.inf)
-    return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
+    return (state, total, tally.add_step(step.prediction.code, step.info)), keep(step)
 
 
 def _round(
@@ -245,6 +245,6 @@ def run(
 
     report_run(filter_, state, solution.final, solution.tally, again, time_s)
     if keep is everything and is_known(solution.tally):
-        tally = solution.tally.looking(solution.steps.info, measurements)
+        tally = solution.tally.with_innovations(solution.steps.info, measurements)
         solution = solution._replace(tally=tally)
     return solution

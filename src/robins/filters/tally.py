@@ -48,7 +48,7 @@ class Tally(NamedTuple):
         updates, nis, dof = (dict.fromkeys(sensors, zero) for zero in zeros)
         return cls(zeros[0], updates, nis, dof)
 
-    def and_step(self, prediction: Numbers, info: Mapping[str, StepInfo]) -> Tally:
+    def add_step(self, prediction: Numbers, info: Mapping[str, StepInfo]) -> Tally:
         """Add a step: the code of its prediction, and its updates by sensor."""
         judged = {k: (i.dof > 0) & (i.code != int(Code.REFUSED)) for k, i in info.items()}
         predictions = self.predictions + _one(prediction)
@@ -61,7 +61,7 @@ class Tally(NamedTuple):
         dof = {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()}
         return Tally(predictions, self.updates | updates, self.nis | nis, self.dof | dof)
 
-    def looking(
+    def with_innovations(
         self, info: Mapping[str, tuple[State, ...]], readings: Mapping[str, State] | None = None
     ) -> Tally:
         """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
@@ -115,8 +115,8 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
     measurements refused; sensors with more than a tenth of the measurements where the local filters
     of a joined one were more than 5 standard deviations apart; and sensors with a mean NIS per
     degree of freedom above 4 or below 1/16 and outside the 99.9 % band of chi-square with a tenth
-    of the degrees of freedom. A run that keeps whole steps (`Tally.looking`) is also tested by
-    `whiteness.suspicions`.
+    of the degrees of freedom. A run that keeps whole steps (`Tally.with_innovations`) is also
+    tested by `whiteness.suspicions`.
 
     Args:
         tally: of a run (`Solution.tally`), or of several with leading axes.
@@ -144,11 +144,11 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
             )
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:
-            found += _off(sensor, nis / dof, dof, sensor in assumed)
+            found += _nis_sentence(sensor, nis / dof, dof, sensor in assumed)
     return found + suspicions(tally.looks, assumed)
 
 
-def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
+def _nis_sentence(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     """Sentence on a mean NIS per degree of freedom that is far from one."""
     low, high = correlated_band(dof, TEST_LEVEL)
     if (cautious or min(low, NIS_LOW) <= ratio) and ratio <= max(high, NIS_HIGH):

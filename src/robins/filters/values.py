@@ -82,7 +82,7 @@ def is_share(x: Numbers) -> Numbers:
     return (x > 0.0) & (x <= 1.0)
 
 
-def is_chance(x: Numbers) -> Numbers:
+def is_probability(x: Numbers) -> Numbers:
     """Test for numbers in (0, 1)."""
     return (x > 0.0) & (x < 1.0)
 

@@ -151,7 +151,7 @@ def _best(
         try:
             free = np.eye(d + len(_PAIRS[d]))
             fitted = _refined(unit, *_direct_ellipsoid(unit), free=free)
-            found = _told(unit, *fitted, free, centre, size, strength_t)
+            found = _calibration_in_tesla(unit, *fitted, free, centre, size, strength_t)
             _refuse_stretched(found)
             return found
         except CalibrationError as error:
@@ -160,7 +160,7 @@ def _best(
             why = error
     free = _of_sphere(d)
     fitted = _refined(unit, *_direct_sphere(unit), free=free)
-    found = _told(unit, *fitted, free, centre, size, strength_t)
+    found = _calibration_in_tesla(unit, *fitted, free, centre, size, strength_t)
     if soft_iron is None and found.after_t > _OFF * found.field_t:
         share = found.after_t / found.field_t
         raise CalibrationError(
@@ -378,7 +378,7 @@ def _correlation(x: np.ndarray) -> float:
     return 1.0 + 2.0 * float(rho[1:last].sum() / rho[0])
 
 
-def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
+def _calibration_in_tesla(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     """Result in tesla, with its covariance and the coverage of directions."""
     noise = _robust_sigma(_distances(unit, offset, W, 0.0))
     distance = _distances(unit, offset, W, noise)

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc
 
 from robins import _float64  # noqa: F401
-from robins.earth.stars import StarIndex, Stars, near, refuse_other_lengths
+from robins.earth.stars import StarIndex, Stars, near, refuse_non_unit
 from robins.errors import require
 from robins.filters.belief import Number
 from robins.ins.vector_attitude import checked_sigma
@@ -92,7 +92,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     unit = np.asarray(stars.unit_i, float)
     if unit.ndim != 2 or unit.shape[1] != 3 or len(unit) < 4:
         raise ValueError(f"unit_i must have shape (N, 3), N four at least, got {unit.shape}")
-    refuse_other_lengths(unit)
+    refuse_non_unit(unit)
     tree = KDTree(unit)
     pairs = tree.query_pairs(2.0 * np.sin(field / 2.0), output_type="ndarray")
     require(len(pairs), f"no two stars are within the field of {np.degrees(field):g} deg")

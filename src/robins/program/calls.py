@@ -1,10 +1,10 @@
 """Templates of jaxprs that were walked before, for further calls of the same form.
 
 A jaxpr is walked once for each row of a batch, each sigma point, each hypothesis of a bank, and in
-each attempt of `robins.program.trace.lasting`. What a walk writes depends on the form of its
-arguments: which numbers are known, which nodes are the same, and what is negated or tested to be
-finite. It may also depend on how arguments are computed from one another: if one is the sine of
-another, and the jaxpr takes that sine too, both are one node. Such a call is no template for
+each attempt of `robins.program.trace.with_preserved_zeros`. What a walk writes depends on the form
+of its arguments: which numbers are known, which nodes are the same, and what is negated or tested
+to be finite. It may also depend on how arguments are computed from one another: if one is the sine
+of another, and the jaxpr takes that sine too, both are one node. Such a call is no template for
 others.
 """
 

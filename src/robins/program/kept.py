@@ -149,7 +149,7 @@ def cached_by_name(
     return program, tape
 
 
-def remembered(
+def cached_value(
     known: OrderedDict[Hashable, T], key: Hashable, make: Callable[[], T], most: int
 ) -> T:
     """Cached value of a key, computed if missing; beyond `most` entries the oldest is dropped."""

@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import cached_by_name, remembered, second_result
+from robins.program.kept import cached_by_name, cached_value, second_result
 from robins.program.kinds import kind_of
 from robins.program.names import Tree
 from robins.program.native import Engine, Step, address
@@ -128,7 +128,7 @@ class NativeState:
         content: Hashable,
         engine: Engine = interpreted_step,
         unroll: int | None = LIVE_UNROLL,
-        lasting: bool = False,
+        persistent: bool = False,
     ):
         """Lay a state out in memory.
 
@@ -138,14 +138,14 @@ class NativeState:
                 this process.
             engine: what makes steps of programs: `interpreted_step`, or `compiled_step`.
             unroll: as in `trace`.
-            lasting: content and names distinguish functions in other processes too, if they have
+            persistent: content and names distinguish functions in other processes too, if they have
                 texts (`names.by_name`): then programs of the interpreter are kept in the user's
                 cache.
 
         Raises:
             ProgramError: the state holds numbers that have no place in a program.
         """
-        self._lasting = lasting
+        self._persistent = persistent
         self._content, self._how = content, (engine, unroll)
         leaves, self._tree = jax.tree_util.tree_flatten(state)
         paths = jax.tree_util.tree_flatten_with_path(state)[0]
@@ -225,7 +225,7 @@ class NativeState:
         forms = [form(x) for x in leaves]
         key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
         make = partial(self._made, key[:-1], function, args)
-        program, result, step = remembered(_known, key, make, _MOST)
+        program, result, step = cached_value(_known, key, make, _MOST)
         count = len(self._slots)
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
@@ -251,7 +251,7 @@ class NativeState:
         """
         engine, unroll = self._how
         write = partial(self._traced, function, args)
-        if self._lasting and engine is interpreted_step:
+        if self._persistent and engine is interpreted_step:
             interpreter = interpreter_of_one()
             program, tape = cached_by_name("step", (key, unroll), write, interpreter)
             step = interpreter.steps(tape)

@@ -13,7 +13,7 @@ import numpy as np
 
 from robins.errors import require
 from robins.program.interpreter import interpreter_of_one
-from robins.program.kept import cached_by_name, remembered, second_result
+from robins.program.kept import cached_by_name, cached_value, second_result
 from robins.program.kinds import is_key
 from robins.program.lanes import KINDS, CompiledRounds
 from robins.program.memory import LIVE_UNROLL, form
@@ -64,7 +64,7 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
         program, tape = cached_by_name("scan", key, write, interpreter)
         return program, tape, second_result(program, body, *one)
 
-    program, tape, keeps = remembered(_known, key, made, _MOST)
+    program, tape, keeps = cached_value(_known, key, made, _MOST)
     rounds = CompiledRounds(program, length, count, 0, engine=lambda _: interpreter.rounds(tape))
     found = [a[0] for a in rounds(1, [(a, False) for a in arrays])]
     begun, _ = tree.children()

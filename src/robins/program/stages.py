@@ -79,7 +79,7 @@ from robins.program.loops import (
 from robins.program.names import Tree
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import lasting
+from robins.program.trace import with_preserved_zeros
 
 WORTH = 5_000  # operations of a loop that is worth a compiler; others are interpreted
 FEWEST = 8  # number of equations from which on any loop is worth one
@@ -248,7 +248,7 @@ class AxisLoop:
         if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
             return
         body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
-        self._write = lambda: lasting(
+        self._write = lambda: with_preserved_zeros(
             lambda some, calls: [body.program(known, some, self._unroll, calls)], zeros
         )[0]
         try:

@@ -105,7 +105,7 @@ def trace_steps(
     def made(zeros: Zeros, calls: Calls) -> list[Program]:
         return [_program(*jaxpr, unroll, zeros, calls) for jaxpr in jaxprs]
 
-    return lasting(made, zeros)
+    return with_preserved_zeros(made, zeros)
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
@@ -118,7 +118,9 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
 Zeros = dict[int, np.ndarray]  # by index of an argument, mask of its zero entries
 
 
-def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list[Program]:
+def with_preserved_zeros(
+    made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros
+) -> list[Program]:
     """Programs of steps of one state, with those of the given zeros that all steps preserve.
 
     Args:

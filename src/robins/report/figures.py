@@ -53,7 +53,7 @@ def _scatters(solution: xr.Dataset, block: str) -> bool:
     return find(solution, "rms")[block].attrs.get("runs", 2) != 1
 
 
-def _tells_more(solution: xr.Dataset, block: str) -> bool:
+def _shows_more_than_error(solution: xr.Dataset, block: str) -> bool:
     """True if an estimate shows more than its error, such as one that should become constant."""
     return block not in find(solution, "error") or "bias" in block or "scale" in block
 
@@ -69,7 +69,7 @@ FIGURES = (
     Figure(curves.within, "within", EACH),
     Figure(curves.worst_case, "note"),
     Figure(suspects, "wrong mean_wrong truly_wrong"),
-    Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
+    Figure(curves.estimates, "estimate sigma", EACH, _shows_more_than_error),
     Figure(curves.values, "value sigma", EACH),
     Figure(curves.height, "track reference gnss"),
     Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused", EACH),

@@ -33,7 +33,7 @@ class ResultError(RobinsError):
         super().__init__(what, self.path, fix)
 
 
-def cannot(path: str | os.PathLike[str], doing: str, error: Exception) -> ResultError:
+def result_error(path: str | os.PathLike[str], doing: str, error: Exception) -> ResultError:
     """The `ResultError` for a failure of the file system or of a library that writes files."""
     code = error.errno if isinstance(error, OSError) else None
     why = (error.strerror if isinstance(error, OSError) else None) or str(error)

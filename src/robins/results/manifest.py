@@ -13,7 +13,7 @@ from pathlib import Path
 
 from robins import __version__
 from robins.foreign import decoding
-from robins.results.errors import ResultError, cannot
+from robins.results.errors import ResultError, result_error
 from robins.results.summary import Json, dumps, loads, plain
 
 SCHEMA_VERSION = 1
@@ -94,7 +94,7 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Json]:
             shown, f"is not a result of robins: it has no {NAME}", "name a folder robins wrote"
         ) from None
     except OSError as error:
-        raise cannot(shown, f"read {NAME}", error) from error
+        raise result_error(shown, f"read {NAME}", error) from error
     with decoding(lambda why: ResultError(shown, f"{NAME} is damaged ({why})", _REMAKE)):
         manifest = loads(text)
     if not isinstance(manifest, dict) or not isinstance(manifest.get("schema"), int):
@@ -141,7 +141,7 @@ def verify(folder: Path, manifest: Mapping[str, Json], shown: str | os.PathLike[
         except FileNotFoundError:
             raise ResultError(shown, f"{name} is missing", _REMAKE) from None
         except OSError as error:
-            raise cannot(shown, f"read {name}", error) from error
+            raise result_error(shown, f"read {name}", error) from error
         if found["size"] != expected["size"]:
             sizes = f"{found['size']} bytes instead of {expected['size']}"
             raise ResultError(shown, f"{name} is damaged: it has {sizes}", _REMAKE)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from robins.foreign import decoding
 from robins.results import dataframe, folder, manifest, solution, summary
-from robins.results.errors import ResultError, cannot
+from robins.results.errors import ResultError, result_error
 from robins.results.summary import Json
 
 
@@ -67,7 +67,7 @@ def read(path: str | os.PathLike[str]) -> Result:
         text = (where / "summary.json").read_bytes()
         dataset = solution.read(where / "solution.nc") if "solution.nc" in made["files"] else None
     except OSError as error:
-        raise cannot(path, "read the result", error) from error
+        raise result_error(path, "read the result", error) from error
     shown = Path(path) if where == folder.resolve(path) else where
     damaged = "summary.json is damaged"
     with decoding(lambda why: ResultError(path, f"{damaged} ({why})", "make the result again")):

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.foreign import arrays_of, decoding
-from robins.results.errors import ResultError, cannot
+from robins.results.errors import ResultError, result_error
 from robins.results.folder import sync
 
 State = Any  # numbers, texts and arrays, in tuples, lists and mappings by name
@@ -65,7 +65,7 @@ def write(path: str | os.PathLike[str], kind: str, parameters: str, state: State
         with suppress(OSError):
             sync(target.parent)
     except OSError as error:
-        raise cannot(target, "write the state", error) from error
+        raise result_error(target, "write the state", error) from error
     finally:
         with suppress(OSError):
             aside.unlink()
@@ -82,7 +82,7 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
         with open(path, "rb") as file:
             content = file.read(_LARGEST + 1)
     except OSError as error:
-        raise cannot(path, "read the state", error) from error
+        raise result_error(path, "read the state", error) from error
     header, arrays = _unpacked(content, path)
     if header.get("version") != VERSION:
         what = (

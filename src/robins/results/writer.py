@@ -12,7 +12,7 @@ from time import monotonic, sleep
 import xarray as xr
 
 from robins.results import folder, manifest, solution, summary
-from robins.results.errors import ResultError, cannot
+from robins.results.errors import ResultError, result_error
 from robins.results.summary import Json
 
 SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
@@ -116,7 +116,7 @@ class ResultWriter:
             else:
                 path.write_bytes(content)
         except OSError as error:
-            raise cannot(self.path, f"write {name}", error) from error
+            raise result_error(self.path, f"write {name}", error) from error
 
     def commit(self) -> Path:
         """Put the result in place; the last call.
@@ -141,7 +141,7 @@ class ResultWriter:
         try:
             folder.commit(self._stage)
         except OSError as error:
-            raise cannot(self.path, "put the result in its place", error) from error
+            raise result_error(self.path, "put the result in its place", error) from error
         for path in self._moved:
             path.unlink(missing_ok=True)
         self.discard()
@@ -193,7 +193,7 @@ def _staged(path: Path, timeout_s: float) -> folder.StagedFolder:
                 ) from None
             sleep(_POLL_S)
         except OSError as error:
-            raise cannot(path, "make the result folder", error) from error
+            raise result_error(path, "make the result folder", error) from error
 
 
 def _check_replaceable(path: Path) -> None:
@@ -216,7 +216,7 @@ def _check_replaceable(path: Path) -> None:
         if not any(target.iterdir()):
             return
     except OSError as error:
-        raise cannot(path, "look into the folder", error) from error
+        raise result_error(path, "look into the folder", error) from error
     if manifest.NAME not in held:
         raise ResultError(path, "holds files that are not a result of robins", elsewhere)
     listed = manifest.listed(target)

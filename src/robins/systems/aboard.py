@@ -24,7 +24,7 @@ def filter_instruments(
     return tuple(sensor for _, sensor in there), tuple((i.name, i.taken) for i, _ in there)
 
 
-def taken(of: Taken, world: Any) -> dict[str, Any]:
+def measurements_of(of: Taken, world: Any) -> dict[str, Any]:
     """Measurements ``y`` and auxiliary inputs ``aux`` of a filter's `Case`, by sensor; pure."""
     seen = {name: take(world) if take else (world.readings[name], None) for name, take in of}
     aux = {name: aux for name, (_, aux) in seen.items() if aux is not None}

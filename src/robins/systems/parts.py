@@ -96,7 +96,7 @@ def as_array(numbers: PyTree) -> Numbers:
     return (np if _given.known(numbers) else jnp).asarray(numbers, float)
 
 
-def any_there(numbers: Sequence[Number]) -> bool:
+def may_be_nonzero(numbers: Sequence[Number]) -> bool:
     """True if any size is nonzero, or is traced and so may be nonzero."""
     return not _given.known(numbers) or any(numbers)
 

@@ -204,13 +204,13 @@ def run_filters(
             share = (number + done / len(contenders)) / len(pieces)
             progress(share, f"{base}, piece {number + 1} of {len(pieces)}")
             asked = [name for name in causal if causal[name] == base]
-            found = _of_piece(piece, chosen, smoothed=any(name != base for name in asked))
+            found = _piece_estimates(piece, chosen, smoothed=any(name != base for name in asked))
             for name in asked:
                 answers[name].append(found[name != base]._replace(name=name))
     return {name: _joined(parts) for name, parts in answers.items()}
 
 
-def _of_piece(
+def _piece_estimates(
     piece: LogPiece, contender: Contender, smoothed: bool
 ) -> tuple[FilterEstimates, FilterEstimates]:
     """Estimates of a filter on a piece, and of its smoother (if not requested, the same again)."""
@@ -218,11 +218,11 @@ def _of_piece(
     with warnings.catch_warnings():
         # the outcome reports these among its warnings
         warnings.simplefilter("ignore", StepWarning)
-        found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
+        found, why = _run_case(contender, case, everything if smoothed else kept, piece.epoch_s)
         of_steps = mapped_rows(kept, found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
-    tally = found.tally.looking(seen, case.y)
+    tally = found.tally.with_innovations(seen, case.y)
     wrong = probabilities(filter_, seen)
     answer = FilterEstimates(
         "", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why
@@ -234,7 +234,9 @@ def _of_piece(
     return answer, answer._replace(mean=belief.mean, sigma=sigma, updates={}, wrong={})
 
 
-def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tuple[Solution, str]:
+def _run_case(
+    contender: Contender, case: Case, keep: Keep, time_s: np.ndarray
+) -> tuple[Solution, str]:
     """Run by the interpreter, or, if it cannot, by JAX; and the reason for that ("" if none)."""
     arguments = contender.filter, contender.model, case.start, case.y, case.u, case.aux
     try:

@@ -76,7 +76,7 @@ def bench_up(
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
     status = BenchStatus()
-    with _onlooker(flight, status, live, host, port, opened) as watch:
+    with _observer(flight, status, live, host, port, opened) as watch:
         session = Session(flight, file, watch, part(progress, 0.0, 0.95), paused)
         try:
             ran = session.run()
@@ -104,7 +104,7 @@ def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]
 
 
 @contextlib.contextmanager
-def _onlooker(
+def _observer(
     flight: LoadedRun,
     status: BenchStatus,
     live: bool,
@@ -207,11 +207,11 @@ def bench_replay(
             raise InputError(once, "--node", "compare two records with --diff")
         other = None if filter_ else program(flight.setup.ports.get(node, ""))
 
-        def heard_so_far(k: int, n: int) -> None:
+        def report_progress(k: int, n: int) -> None:
             progress(k / max(n, 1), "hearing")
 
         with _starter(flight, node, other) as start:
-            heard = replay(first.entries, rig.wire, node, start, progress=heard_so_far)
+            heard = replay(first.entries, rig.wire, node, start, progress=report_progress)
         frames, first_difference = heard.compared, heard.first_difference
     else:
         frames, both = Differences(rig.wire, step_ns), (first.entries, second.entries)

@@ -26,7 +26,7 @@ from robins.logs.mounting import Mounting, turned
 from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.units import parse
-from robins.workbench.doctor import mounting_of, parted, typed
+from robins.workbench.doctor import mounting_of, separate_files, typed
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import Logs, Option
 
@@ -63,7 +63,7 @@ def samples(
         robins.logs.LogError: a file cannot be read.
         InputError: no file or more than one holds a magnetic field, or none of it lies in between.
     """
-    files, configuration = parted(log)
+    files, configuration = separate_files(log)
     mounting = mounting_of(configuration)
     formats = formats_of(files, columns)
     findings: list[Any] = []
@@ -226,7 +226,7 @@ def calibrate(
     begin_s = 0.0 if begin is None else parse(begin, "time")
     end_s = np.inf if end is None else parse(end, "time")
     progress(0.1, "reading")
-    files, configuration = parted(log)
+    files, configuration = separate_files(log)
     first, shown = files[0], typed(files, columns)
     given = samples(log, begin_s, end_s, columns)
     progress(0.5, "fitting the ellipsoid")

@@ -298,7 +298,7 @@ def campaign_show(where: Where, run: int, *, progress: Progress = ignore_progres
     progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.runs - 1}, of which {run} is shown")
     alone = {name: _kept(store, plan.shard(chunk, name), run, problem) for name in plan.filters}
     if lacking := [name for name, one in alone.items() if one is None]:
-        again = Worker(store, plan, problem).runs_of(chunk, lacking, [run])
+        again = Worker(store, plan, problem).run_statistics(chunk, lacking, [run])
         alone |= {name: of[run] for name, of in again.items()}
     outcome = outcome_of(problem, {name: one for name, one in alone.items() if one}, None)
     return replace(

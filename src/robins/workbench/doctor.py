@@ -74,7 +74,7 @@ def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> LogE
         InputError: there is a configuration without a log, or more than one of these.
         robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be read.
     """
-    files, configuration = parted(paths)
+    files, configuration = separate_files(paths)
     mounting = mounting_of(configuration)
     formats = logs.formats_of(files, columns)
     findings: list[logs.Finding] = []
@@ -105,7 +105,7 @@ def unit_file(
     """
     from robins.systems.ins_gnss import InsGnssReplay  # imported late: it needs JAX
 
-    files, configuration = parted(paths)
+    files, configuration = separate_files(paths)
     if configuration is not None:
         raise InputError(
             "a configuration is written from the log alone", configuration, "omit this file."
@@ -157,7 +157,7 @@ def typed(
     return shlex.join(words)
 
 
-def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | None]:
+def separate_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | None]:
     """The files of a log, and the configuration among them, if there is one.
 
     Raises:

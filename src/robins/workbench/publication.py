@@ -77,10 +77,10 @@ def _write(writer: results.ResultWriter, progress: Progress, outcome: Outcome) -
         for name, content in outcome.files.items():
             writer.save_file(name, content)
 
-        def drawing(done: int, total: int, what: str) -> None:
+        def report_drawing(done: int, total: int, what: str) -> None:
             progress(done / max(total, 1), what)
 
-        report.add(writer, drawing, outcome.notes, outcome.figures)
+        report.add(writer, report_drawing, outcome.notes, outcome.figures)
         return results.read(writer.commit())
 
 

@@ -25,7 +25,7 @@ from robins.logs import Finding
 from robins.logs.doctor import Use
 from robins.results import Outcome, Progress, ignore_progress
 from robins.systems.finding import find_system
-from robins.workbench.doctor import parted, typed
+from robins.workbench.doctor import separate_files, typed
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.formats import require_formats, with_exports
 from robins.workbench.options import Logs, Option
@@ -176,7 +176,7 @@ def open_log(
     found = find_system(system)
     if found.replay is None or found.replay_parameters is None:
         raise InputError(f"{system} does not replay logs")
-    files, configuration = parted(paths)
+    files, configuration = separate_files(paths)
     path = configuration or found.replay_default
     text = scenario.read_text(path) if path is not None else ""
     source = os.fspath(configuration or "the default configuration")

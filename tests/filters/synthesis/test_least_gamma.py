@@ -43,7 +43,7 @@ def test_a_gamma_that_a_gain_meets_is_not_refused():
     assert (found.least.proved, found.least.reached, found.least.step) == (0.0, 0.0, 0)
     assert riccati(p, 1e-3).hinf <= 1e-3
     # and what is a gain's is told: the other methods raise the promise, not the proof
-    assert found.least.with_(made.design) is found.least
+    assert found.least.improved_by(made.design) is found.least
 
 
 def by_inverses(p, gamma):

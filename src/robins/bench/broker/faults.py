@@ -129,7 +129,7 @@ class LinkFault(Parameters):
 
     @pydantic.model_validator(mode="before")
     @classmethod
-    def _at_its_speaker(cls, given: Any) -> Any:
+    def _fill_in_link(cls, given: Any) -> Any:
         """Add link and message to a fault of a sensor or an actuator that leaves them out."""
         if isinstance(given, Mapping) and (
             said := cls.table.device_faults.get(given.get("kind", ""))

@@ -18,7 +18,7 @@ class Events:
         self.kept: list[JsonObject] = []
         self._next = 0
 
-    def happened(self, level: str, time_s: float, text: str) -> JsonObject:
+    def add(self, level: str, time_s: float, text: str) -> JsonObject:
         """Add an event; one equal to the last, unless that is acknowledged, raises its count."""
         last = self.kept[-1] if self.kept else {}
         if (last.get("level"), last.get("text")) == (level, text) and "acknowledged" not in last:

@@ -147,7 +147,7 @@ class LivePage(Closing):
             time_s: since the start of the run.
             text: one sentence.
         """
-        self._lines.append(feed.to_json(self._events.happened(level, time_s, text)).encode())
+        self._lines.append(feed.to_json(self._events.add(level, time_s, text)).encode())
         self._pump()
 
     def new_run(self, run: int) -> None:

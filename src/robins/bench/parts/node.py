@@ -65,13 +65,13 @@ def fewer_collections() -> Iterator[None]:
 def main(arguments: Sequence[str]) -> int:
     """Run a part until the bench sends stop or has gone."""
     try:
-        return _be(arguments)
+        return _run_part(arguments)
     except RobinsError as error:  # the bench shows its last line to the user
         print(error, file=sys.stderr)
         return 2
 
 
-def _be(arguments: Sequence[str]) -> int:
+def _run_part(arguments: Sequence[str]) -> int:
     rig_name, name, port, config_path, *more = arguments
     # An interrupt of the terminal is for the bench, which then stops its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -65,7 +65,7 @@ def program(text: str) -> Path | None:
     return path.resolve() if path.is_file() and os.access(path, os.X_OK) else None
 
 
-def parted(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path]]:
+def replacements(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path]]:
     """Boards at their ports, and programs, each by the part that it replaces.
 
     Raises:

@@ -211,7 +211,7 @@ class _Replay:
         latest, last = -1, self._life.begin.header
         for row in rows:
             if not row.to:
-                self._life.said(row)
+                self._life.add_recorded(row)
                 continue
             self._write(row.data)
             last = row.found[-1].header if row.found else last
@@ -221,7 +221,7 @@ class _Replay:
                 if step >= latest:  # a part does not keep its answers to older ones
                     self._where = f"in step {step}"
                     for frame in self._until_done(step, latest):
-                        self._life.says(frame)
+                        self._life.add_new(frame)
                     latest = step
                 count()
         if last.type != _STOP:  # the record ends before the run did
@@ -341,7 +341,7 @@ class _PartLifetime:
         """Record a tick that was sent to the part."""
         self._tick = step
 
-    def said(self, row: _LinkRow) -> None:
+    def add_recorded(self, row: _LinkRow) -> None:
         """Add a recorded answer."""
         for frame in row.found:
             head = frame.header
@@ -356,7 +356,7 @@ class _PartLifetime:
                 step = int(BARE.decode("done", frame.payload)["step"])
                 self._answered = max(self._answered, step)
 
-    def says(self, frame: Frame) -> None:
+    def add_new(self, frame: Frame) -> None:
         """Add a new answer."""
         self._says(frame)
         self._compared.take(1, frame)

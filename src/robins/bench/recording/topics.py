@@ -119,13 +119,15 @@ class Topics:
         for row in rows:
             if row.message not in wire.numbers:
                 there = ", ".join(wire.numbers)
-                raise _wrong(row, f"no message '{row.message}'", f"one of {there}")
+                raise _type_error(row, f"no message '{row.message}'", f"one of {there}")
             if row.type != JSON and row.type not in TYPES:
-                raise _wrong(row, f"no type '{row.type}'", f"one of {', '.join([*TYPES, JSON])}")
+                raise _type_error(
+                    row, f"no type '{row.type}'", f"one of {', '.join([*TYPES, JSON])}"
+                )
             if not re.fullmatch(r"(/[A-Za-z_]\w*)+", row.topic):
-                raise _wrong(row, "this is no name of a topic", "one such as /sensor/imu")
+                raise _type_error(row, "this is no name of a topic", "one such as /sensor/imu")
             if row.topic in taken or re.fullmatch("/[^/]+/(to|from)", row.topic):
-                raise _wrong(row, "the topic has other messages", "another name")
+                raise _type_error(row, "the topic has other messages", "another name")
             taken.add(row.topic)
             _try(wire, row)
             number = wire.numbers[row.message]
@@ -154,7 +156,7 @@ class Topics:
         return made
 
 
-def _wrong(row: Topic, what: str, fix: str) -> RecordingError:
+def _type_error(row: Topic, what: str, fix: str) -> RecordingError:
     return RecordingError(what, f"topic '{row.topic}'", f"give {fix}")
 
 
@@ -180,10 +182,10 @@ def _try(wire: Wire, row: Topic) -> None:
             _bytes_of(row, made, _stamp(row, values, 0))
     except _FAILS as error:
         why = f"its function fails ({type(error).__name__}: {error})"
-        raise _wrong(row, why, f"one of the fields {', '.join(values)}") from None
+        raise _type_error(row, why, f"one of the fields {', '.join(values)}") from None
     if not fits:
         why = f"its function makes {type(made).__name__}, not {row.type}"
-        raise _wrong(row, why, "one that makes this type")
+        raise _type_error(row, why, "one that makes this type")
 
 
 def _bytes_of(row: Topic, made: Any, time_ns: int) -> bytes:

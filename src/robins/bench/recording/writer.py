@@ -75,7 +75,7 @@ class Recorder(Closing):
         self._topics: dict[str, int] = {}  # likewise, of all topics
         self._schemas: dict[tuple[str, str], int] = {}
         self._failed = False
-        self._clean()
+        self._start_chunk()
         try:
             self._disk = _Disk(self.path, "w" if overwrite else "x")
         except FileExistsError:
@@ -144,7 +144,7 @@ class Recorder(Closing):
         if self._failed or not self._taken:
             return
         taken = self._taken
-        self._clean()
+        self._start_chunk()
         try:
             self._mcap.flush()
         except OSError:
@@ -168,7 +168,7 @@ class Recorder(Closing):
         finally:
             self._disk.close()
 
-    def _clean(self) -> None:
+    def _start_chunk(self) -> None:
         """Start a chunk."""
         self._first = self._last = self._taken = self._size = 0
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robins.results.errors import cannot
+from robins.results.errors import result_error
 
 LARGE = 64 << 20  # bytes above which arrays are stored on disk
 _PIECE = 1 << 17  # numbers written at once
@@ -48,7 +48,7 @@ class NumberStore:
             self._file = _filled(shapes, size, where)
         except OSError as error:
             doing = f"keep {size / 1e6:.0f} MB of what passes in a run"
-            raise cannot(where, doing, error) from error
+            raise result_error(where, doing, error) from error
         self.arrays, at = {}, 0
         for name, (shape, what) in shapes.items():
             array = np.ndarray(shape, np.array(what).dtype, buffer=self._file, offset=at)

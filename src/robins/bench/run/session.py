@@ -21,7 +21,7 @@ from robins.bench.broker.restart import SentFrames
 from robins.bench.evaluation import RunResult
 from robins.bench.live.feed import JsonObject
 from robins.bench.parts.node import fewer_collections, realtime
-from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
+from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, replacements
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.recording.topics import completed
 from robins.bench.rig import LoadedRun, RunConfig
@@ -106,7 +106,7 @@ class Session:
         self._tell = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
-        self.ports, programs = parted(setup.ports)
+        self.ports, programs = replacements(setup.ports)
         if config is None:
             self._tell(0.0, "preparing")
             config = config_of(flight)

@@ -18,7 +18,7 @@ from scipy import integrate, optimize, special, stats
 
 from robins import linalg
 from robins.filters.belief import Belief
-from robins.filters.kalman import Advanced, Around, Filter, FilterState, Follow, Updated
+from robins.filters.kalman import Advanced, Filter, FilterState, FilterWrapper, Follow, Updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Normalised, normalised
@@ -84,7 +84,7 @@ def log_density(innovation: Normalised) -> Float[Array, ""]:
 
 
 @value
-class Scored(Around):
+class Scored(FilterWrapper):
     """Filter made by `scored`."""
 
     # `Filter` wraps both for steps that are not taken; here the inner filter does so itself.

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief
-from robins.filters.kalman import Advanced, Again, Around, Filter, FilterState, Updated
+from robins.filters.kalman import Advanced, Again, Filter, FilterState, FilterWrapper, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import kind, number, value
 
@@ -29,7 +29,7 @@ class AdjustableMemory:
 
 
 @value
-class Adjustable(Around):
+class Adjustable(FilterWrapper):
     """Filter made by `adjustable`."""
 
     names: tuple[str, ...] = kind()

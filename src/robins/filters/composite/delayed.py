@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Advanced, Around, Filter, FilterState, Updated
+from robins.filters.kalman import Advanced, Filter, FilterState, FilterWrapper, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.trees import repeated, row_of, select
 from robins.filters.values import kind, on_device, value
@@ -87,7 +87,7 @@ _Repeated = tuple[FilterState, FilterState, Array, StepInfo, Array, Array]
 
 
 @value
-class Delayed(Around):
+class Delayed(FilterWrapper):
     """Filter made by `delayed`."""
 
     model: Model

@@ -61,7 +61,7 @@ FULL = (
 
 
 @value
-class SideBySide(JoinedFilter):
+class DistributedFilter(JoinedFilter):
     """Filter made by `distributed` or `intersecting`: each local has the whole prior and noise."""
 
     criterion: Criterion | Numbers | None  # or (channels,) weights; None: as if independent
@@ -134,7 +134,7 @@ def distributed(
     if common is not None:
         require(common >= 1, "distributed: at least one component must be common", common)
     owners(channels)
-    return SideBySide(tuple(channels), "distributed", None, feedback, common)
+    return DistributedFilter(tuple(channels), "distributed", None, feedback, common)
 
 
 def intersecting(
@@ -160,4 +160,4 @@ def intersecting(
     check_criterion(criterion, len(channels))
     owners(channels)
     given = criterion if isinstance(criterion, str) else number("weights must be real", criterion)
-    return SideBySide(tuple(channels), "intersecting", given, feedback)
+    return DistributedFilter(tuple(channels), "intersecting", given, feedback)

@@ -122,7 +122,7 @@ class Guarded(Composite):
         none, excess = jnp.zeros(count), jnp.full(count, 0.0 if self.trusted else _SURE * SLACK)
         return _given_out(GuardMemory(*states, none, excess, none, none, jnp.zeros((), int)))
 
-    def taken_over(self, watch: GuardMemory) -> FilterState:
+    def reset_to_reference(self, watch: GuardMemory) -> FilterState:
         """State of the filter, reset to the belief of the reference.
 
         If both are joined filters with the same number of locals, each local is reset to its
@@ -145,7 +145,7 @@ class Guarded(Composite):
         wrong = jnp.any(sure | (evidence > self.limit))
         mean = M / np.sum(M, axis=1, keepdims=True)
         return self.learnt(watch, mean, renewed, square, gained, sure)._replace(
-            filter=select(wrong, self.taken_over(watch), watch.filter),
+            filter=select(wrong, self.reset_to_reference(watch), watch.filter),
             evidence=jnp.where(wrong, 0.0, evidence),
             trips=watch.trips + wrong.astype(int),
         )
@@ -194,7 +194,7 @@ class Guarded(Composite):
         notes, failed = dict(info.notes), is_failure(info.code)
         both = watch._replace(filter=mine)
         if sensor.name in self.assumed:
-            renewed, other = 0.0, _not_believed(info)
+            renewed, other = 0.0, _unused_update(info)
         else:
             reference, other = self.reference.update(watch.reference, sensor, y, aux)
             both = both._replace(reference=reference)
@@ -261,7 +261,7 @@ def guarded(
             or a parameter is out of its range; at `init`, the model has no sensor of such a name,
             or the state has no such component.
     """
-    assumed, judging = _two_sides(assumption, judges)
+    assumed, judging = _sensors_of_sides(assumption, judges)
     named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
     require(named, "guarded groups must each name a component", groups)
     return Guarded(
@@ -282,7 +282,7 @@ def _positive(name: str, given: Number) -> Numbers:
     return number(f"guarded {name} must be positive", given, lambda x: x > 0.0)
 
 
-def _two_sides(
+def _sensors_of_sides(
     assumption: str | Sequence[str], judges: str | Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the sensors of the assumption and of the judges; no sensor may be both."""
@@ -322,7 +322,7 @@ def _members(groups: Groups | None, n: int) -> np.ndarray:
     return M
 
 
-def _not_believed(info: StepInfo) -> StepInfo:
+def _unused_update(info: StepInfo) -> StepInfo:
     """Information of a measurement that did not change the reported belief."""
     missing = info.code == int(Code.MISSING)
     return info._replace(

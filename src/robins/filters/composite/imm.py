@@ -244,7 +244,7 @@ class Imm(Filter):
         begun, log_next = (states, log_now) if self.modes.size == 1 else self.mixed(states, log_now)
         after, code, _ = self.modes.every(lambda m, s: m.predict(s, motion, u), begun)
         taken = code == int(Code.DONE)
-        log_next = _among(taken, log_next)
+        log_next = _without_failed(taken, log_next)
         failed = code[jnp.argmax(log_now)]
         belief = _mixture(self.modes.beliefs(after), log_next)
         outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
@@ -384,7 +384,7 @@ def _judged(seen: StepInfo, log_prior: Array) -> tuple[Array, Array, Array]:
     return jnp.where(sound, log_prior, -jnp.inf), log_post, used
 
 
-def _among(taken: Array, log_probability: Array) -> Array:
+def _without_failed(taken: Array, log_probability: Array) -> Array:
     """Log-probabilities with zero probability for modes whose step failed, unless all did."""
     kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
     return log_normalised(kept)[0]

@@ -36,7 +36,7 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.composite.bank import EVERY, transitions
-from robins.filters.kalman import Advanced, Around, Filter, FilterState, Prediction, Updated
+from robins.filters.kalman import Advanced, Filter, FilterState, FilterWrapper, Prediction, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import Numbers, kind, value
 
@@ -156,7 +156,7 @@ def _augmented_sensor(sensor: Sensor, names: Sequence[str], of: OffsetHypothesis
 
 
 @value
-class UnderHypothesis(Around):
+class UnderHypothesis(FilterWrapper):
     """Filter made by `under_hypothesis`."""
 
     of: OffsetHypothesis
@@ -201,7 +201,7 @@ def _marginal_belief(wide: FilterState) -> FilterState:
 
 
 @value
-class Marginal(Around):
+class Marginal(FilterWrapper):
     """Filter made by `marginal`."""
 
     names: tuple[str, ...] = kind()

@@ -145,7 +145,7 @@ def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int
 
 @value
 class PatientRule(Rule):
-    """Rule of `opening`."""
+    """Rule of `with_recovery`."""
 
     inner: Rule
     patience: Numbers  # () measurements in a row
@@ -178,7 +178,7 @@ class PatientRule(Rule):
         return memory, select(due, wide, Belief(*faded)), given
 
 
-def opening(rule: Rule, patience: Number | None) -> Rule:
+def with_recovery(rule: Rule, patience: Number | None) -> Rule:
     r"""Wrap a robust rule so that it recovers from refusals in a row, as in a diverged filter.
 
     After ``patience`` measurements of a sensor in a row that were refused or had a weight below

@@ -9,7 +9,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.rules._robust import MOST, PATIENCE, opening, reweighted, weighed
+from robins.filters.rules._robust import MOST, PATIENCE, reweighted, weighed, with_recovery
 from robins.filters.values import Numbers, kind, number, value
 
 
@@ -56,11 +56,11 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
             measurements lose weight, above 6 outliers of 10 sigma keep some.
         iterations: number of iterations of the weights, at least 1.
         patience: measurements in a row with a weight below 1e-2 before one is used
-            (`robins.filters.rules._robust.opening`); None never recovers.
+            (`robins.filters.rules._robust.with_recovery`); None never recovers.
 
     Raises:
         ValueError: an argument is out of its range.
     """
     sigma = number("correntropy kernel must be positive", kernel, lambda k: k > 0.0)
     require(iterations >= 1, "correntropy iterations must be at least 1", iterations)
-    return opening(Correntropy(sigma, iterations), patience)
+    return with_recovery(Correntropy(sigma, iterations), patience)

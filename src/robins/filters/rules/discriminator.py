@@ -26,7 +26,7 @@ from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
 from robins.filters.rules._robust import HARDLY, scale_to_quantile, weighed, widened_to_dof
-from robins.filters.values import Numbers, is_chance, is_factor, is_share, kind, number, value
+from robins.filters.values import Numbers, is_factor, is_probability, is_share, kind, number, value
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -168,7 +168,7 @@ def discriminator(
 
 def _levels(rho: Numbers, threshold: Number | None, false_alarm: Number, looks: Number) -> Numbers:
     """(MOST + 1,) limits of tr V over its expectation, by false_alarm or by a threshold."""
-    chance = number("discriminator false_alarm must lie in (0, 1)", false_alarm, is_chance)
+    chance = number("discriminator false_alarm must lie in (0, 1)", false_alarm, is_probability)
     often = number("discriminator looks must be at least 1 and finite", looks, is_factor)
     if threshold is None:
         return _fading.chance_levels(float(rho), MOST, float(chance / often))

@@ -26,7 +26,15 @@ from robins.filters.linearise import Transition
 from robins.filters.model import Data, Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.values import Numbers, finite_leaf, is_chance, is_known, kind, number, value
+from robins.filters.values import (
+    Numbers,
+    finite_leaf,
+    is_known,
+    is_probability,
+    kind,
+    number,
+    value,
+)
 
 
 @value
@@ -110,7 +118,7 @@ def equality(
             argument is out of its range; at `init`, D, noise or weight do not fit the state.
     """
     if gate is not None:
-        gate = number("equality gate must lie between 0 and 1, or be None", gate, is_chance)
+        gate = number("equality gate must lie between 0 and 1, or be None", gate, is_probability)
     require(iterations >= 1, "equality iterations must be at least 1", iterations)
     d = jax.tree_util.tree_map(
         lambda leaf: finite_leaf("equality d", leaf), d, is_leaf=lambda x: isinstance(x, list)

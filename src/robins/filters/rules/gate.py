@@ -18,7 +18,7 @@ from robins.filters.chi_square import limits, within
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
-from robins.filters.values import Numbers, is_chance, kind, number, value
+from robins.filters.values import Numbers, is_probability, kind, number, value
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
@@ -149,7 +149,7 @@ def gate(
     Raises:
         ValueError: an argument is out of its range.
     """
-    chance = number("gate probability must lie between 0 and 1", probability, is_chance)
+    chance = number("gate probability must lie between 0 and 1", probability, is_probability)
     one_of("gate recovery", recovery, Recovery)
     one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"

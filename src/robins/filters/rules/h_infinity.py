@@ -23,7 +23,7 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Again, Rule
 from robins.filters.rules import _inflation
 from robins.filters.rules._inflation import GivenWeight, Weight, inflated, local_bound
-from robins.filters.values import Numbers, is_chance, is_known, kind, number, value
+from robins.filters.values import Numbers, is_known, is_probability, kind, number, value
 from robins.manifold import State
 
 Policy = Literal["raise", "raise_gamma", "compensate"]
@@ -319,7 +319,7 @@ def h_infinity(
     inverse = 1.0 / _as_gamma(gamma)
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
-    left = number("margin must lie between 0 and 1", margin, is_chance)
+    left = number("margin must lie between 0 and 1", margin, is_probability)
     if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
             "policy='compensate' changes P after the measurement, estimate='a-priori' needs it "

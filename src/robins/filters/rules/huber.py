@@ -8,7 +8,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.chi_square import MOST, limits, within
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
-from robins.filters.rules._robust import PATIENCE, opening, scale_to_quantile, weighed
+from robins.filters.rules._robust import PATIENCE, scale_to_quantile, weighed, with_recovery
 from robins.filters.values import Numbers, is_share, number, value
 
 
@@ -49,7 +49,7 @@ def huber(
         threshold: k > 0, in standard deviations, for any number of components; None takes it from
             the probability.
         patience: measurements in a row with a weight below 1e-2 before one is used
-            (`robins.filters.rules._robust.opening`); None never recovers.
+            (`robins.filters.rules._robust.with_recovery`); None never recovers.
 
     Raises:
         ValueError: an argument is out of its range.
@@ -58,4 +58,4 @@ def huber(
     if threshold is not None:
         k = number("huber threshold must be positive", threshold, lambda k: k > 0.0)
         limit = k[..., None] ** 2 * np.ones(MOST + 1)
-    return opening(Huber(limit), patience)
+    return with_recovery(Huber(limit), patience)

@@ -14,7 +14,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
+from robins.filters.rules._robust import MOST, PATIENCE, shares, weighed, with_recovery
 from robins.filters.values import Numbers, kind, number, value
 
 Whose = Literal["R", "both"]
@@ -88,7 +88,7 @@ def student_t(
         iterations: number of iterations of c, at least 1.
         whose: heavy tails of the measurement noise only, "R", or of "both" it and the prior.
         patience: measurements in a row with a weight below 1e-2 before one is used
-            (`robins.filters.rules._robust.opening`); None never recovers.
+            (`robins.filters.rules._robust.with_recovery`); None never recovers.
 
     Raises:
         ValueError: an argument is out of its range.
@@ -96,4 +96,4 @@ def student_t(
     nu = number("student_t dof must be positive", dof, lambda nu: nu > 0.0)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)
     one_of("student_t whose", whose, Whose)
-    return opening(StudentT(nu, iterations, whose), patience)
+    return with_recovery(StudentT(nu, iterations, whose), patience)

@@ -56,7 +56,7 @@ class LeastGamma(NamedTuple):
                 self.reached,
             )
 
-    def with_(self, design: Design) -> LeastGamma:
+    def improved_by(self, design: Design) -> LeastGamma:
         """Bounds improved by another certified design, if its norm is less."""
         if design.hinf >= self.reached:
             return self
@@ -88,7 +88,7 @@ def least_gamma(plant: Plant) -> LeastGamma:
         for gamma in (above * (1.0 + _RTOL), 1.01 * above, np.inf):
             if best.hinf <= enough:
                 break
-            K, failed = _play(scaled, gamma, noise)
+            K, failed = _last_gain(scaled, gamma, noise)
             if failed:
                 continue
             try:
@@ -102,20 +102,20 @@ def least_gamma(plant: Plant) -> LeastGamma:
 
 def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[float, float, int]:
     """Greatest gamma (or 0) at which the recursion ends, least at which it does not, end step."""
-    step = _play(plant, low, noise)[1] if low < high else 0
+    step = _last_gain(plant, low, noise)[1] if low < high else 0
     if not step:
         return 0.0, low, 0
     rtol = _ROUGHLY if noise else _RTOL
     while high > low * (1.0 + rtol):
         middle = float(np.sqrt(low * high))
-        if failed := _play(plant, middle, noise)[1]:
+        if failed := _last_gain(plant, middle, noise)[1]:
             low, step = middle, failed
         else:
             high = middle
     return low, high, step
 
 
-def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, int]:
+def _last_gain(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, int]:
     """Last gain (n, m) of the recursion, and the step at which L P L' reached gamma^2, or 0."""
     B = np.hstack([plant.Bn, noise * plant.Bw])
     D = np.hstack([plant.Dn, noise * plant.Dw])

@@ -100,7 +100,7 @@ def trade_off(
             notify(len(attempts), total, f"{name}, gamma {gamma:.4g}")
             attempts.append(_attempt(plant, gamma, name))
             if made := attempts[-1].design:
-                least = least.with_(made)
+                least = least.improved_by(made)
     return TradeOff(kalman, least, chosen, attempts, left_out)
 
 

@@ -197,7 +197,7 @@ def as_measured(world: AirshipWorld) -> tuple[Array, Array]:
     return _wind(world, world.wind + world.wind_error, world.readings[WIND])
 
 
-def as_it_is(world: AirshipWorld) -> tuple[Array, Array]:
+def true_air(world: AirshipWorld) -> tuple[Array, Array]:
     """True wind and true velocity through the air."""
     return _wind(world, world.wind, world.air_b)
 
@@ -207,7 +207,7 @@ def steady(world: AirshipWorld) -> tuple[Array, Array]:
     return _wind(world, jnp.broadcast_to(world.steady_wind, world.wind.shape), world.readings[WIND])
 
 
-def along_the_nose(world: AirshipWorld) -> tuple[Array, Array]:
+def forward_airspeed(world: AirshipWorld) -> tuple[Array, Array]:
     """Airspeed along the forward axis, as in the paper, and the forecast of the wind."""
     speed = jnp.linalg.norm(world.readings[WIND], axis=1)
     air_b = speed[:, None] * jnp.array([[1.0, 0.0, 0.0]])

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
 from robins.manifold import retract
-from robins.systems.aboard import Taken, filter_instruments, taken
+from robins.systems.aboard import Taken, filter_instruments, measurements_of
 from robins.systems.airship import instruments
 from robins.systems.airship.error_model import ERRORS, Feedback
 from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
@@ -106,9 +106,9 @@ HARD = (*PLAIN, *instruments.HARD)
 SOFT = (*PLAIN, instruments.SOFT)
 WINDY = (*PLAIN, instruments.AIR_DATA)
 KNOWN = (*PLAIN, *instruments.wind_constraints(taken=instruments.steady))
-EXACT = (*PLAIN, *instruments.wind_constraints(taken=instruments.as_it_is))
+EXACT = (*PLAIN, *instruments.wind_constraints(taken=instruments.true_air))
 PRINTED = (instruments.PRINTED_RADAR, instruments.PRINTED_STARS)
-SIDESLIP = (*PLAIN, *instruments.wind_constraints(taken=instruments.along_the_nose))
+SIDESLIP = (*PLAIN, *instruments.wind_constraints(taken=instruments.forward_airspeed))
 
 CANDIDATES: dict[str, Candidate] = {
     "ekf": Candidate(lambda: _two(ekf), PLAIN),
@@ -157,7 +157,7 @@ def as_case(states: States, of: Taken, sigma: Array, world: AirshipWorld) -> Cas
         start=Belief(states.of(estimate, zero, zero, jnp.zeros(2)), jnp.diag(sigma)),
         u=world.parts if states.in_parts else world.epoch_increments,
         truth=states.of(world.truth, gyro, accel, world.wind_error),
-        **taken(of, world),
+        **measurements_of(of, world),
     )
 
 

@@ -25,7 +25,7 @@ from robins.systems.ins_gnss.log import InsGnssSteps, first_belief, steps_of
 from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.positions import attitudes
 from robins.systems.ins_gnss.recording import Log, believed_sigmas
-from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
+from robins.systems.ins_gnss.rest import DISPLACEMENT_S, UsualIntervals, known_until
 from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_start
 from robins.systems.parts import ImuBlock
 from robins.systems.replaying import imu_blocks
@@ -237,7 +237,7 @@ class InsGnssPath:
         aids, usual = self._parameters.aids, self._usual
         self._known = tuple(known_until(self._log(), aids, usual, since_s))
         # a displacement across an outage starts at the last position before it
-        far = self.fixes[:, 0] <= begin - WAYS_S[-1] - 2.0 * max(1.0, usual.fix_s)
+        far = self.fixes[:, 0] <= begin - DISPLACEMENT_S[-1] - 2.0 * max(1.0, usual.fix_s)
         placed = np.flatnonzero(far & np.all(np.isfinite(self.fixes[:, 1:3]), axis=1))
         self.fixes = self.fixes[placed[-1] if len(placed) else 0 :]
         self._keep(first)

@@ -16,9 +16,9 @@ from robins import rotation
 from robins.program.scanned import named_scan
 from robins.systems.ins_gnss.parameters import Gnss, InsGnssStart
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import WAYS_S, ways
+from robins.systems.ins_gnss.rest import DISPLACEMENT_S, displacements
 
-WINDOWS_S = (0.25, 0.5, *WAYS_S)
+WINDOWS_S = (0.25, 0.5, *DISPLACEMENT_S)
 MOST = 9  # positions of a window, evenly spaced; those of a fast receiver are redundant
 LEAST = 3  # two give no residual that reveals a faulty one
 SURE = 5.0  # sigmas of a speed to give a course: by chance once in 3e5 fixes at rest
@@ -155,7 +155,7 @@ def _gathered(
     at = np.minimum(np.searchsorted(log.gnss_s[known], wanted), max(len(known) - 1, 0))
     once = np.diff(at, axis=1, prepend=-1) > 0
     rows = known[at] if len(known) else np.zeros(wanted.shape, int)
-    north, east = ways(
+    north, east = displacements(
         g.lat_rad[ends][:, None],
         g.lat_rad[rows] - g.lat_rad[ends][:, None],
         g.lon_rad[rows] - g.lon_rad[ends][:, None],

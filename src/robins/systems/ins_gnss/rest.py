@@ -19,7 +19,7 @@ from robins.ins.rest import standstill
 from robins.systems.ins_gnss.parameters import Aids
 from robins.systems.ins_gnss.recording import Log
 
-WAYS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # intervals over which positions are compared
+DISPLACEMENT_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # intervals over which positions are compared
 _SIGMAS = 4.0
 _SEEN = 5.0  # times `aids.moving_speed`: a speed that rest must exclude
 _CALMER = 0.5  # rest without fixes: unrest below this share of the least in motion
@@ -190,7 +190,7 @@ def calmest_in_motion(
 
 def evidence_of(log: Log, speed: float, wait_s: float) -> list[Evidence]:
     """Evidence of motion faster than a speed [m/s] from velocities, displacements and wheels."""
-    evidence = [_by_way(log, speed, wait_s)]
+    evidence = [_by_displacement(log, speed, wait_s)]
     if log.v_n is not None and log.sigma_v is not None:
         known = ~log.withheld & np.all(np.isfinite(log.v_n[:, :2]), axis=1)
         size = np.hypot(*log.v_n[known, :2].T)
@@ -209,7 +209,7 @@ def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: fl
     return Evidence(time_s, moves, *(np.where(x, time_s, np.nan) for x in (moves, rests)))
 
 
-def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
+def _by_displacement(log: Log, speed: float, wait_s: float) -> Evidence:
     """Evidence from displacements to fixes without a velocity, from earlier fixes."""
     g = log.gnss
     known = ~log.withheld & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
@@ -217,14 +217,14 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
     lat, lon = g.lat_rad[known], g.lon_rad[known]
     moves = np.zeros(len(time_s), bool)
     moved_s, rests_s = np.full((2, len(time_s)), np.nan)
-    for way_s in WAYS_S if len(time_s) else ():
+    for way_s in DISPLACEMENT_S if len(time_s) else ():
         before = np.searchsorted(time_s, time_s - way_s + 1e-6, side="right") - 1
         before = np.maximum(before, 0)
-        way = np.hypot(*ways(lat, lat - lat[before], lon - lon[before]))
+        way = np.hypot(*displacements(lat, lat - lat[before], lon - lon[before]))
         lasted, spread = time_s - time_s[before], _SIGMAS * np.hypot(noise, noise[before])
         moved = (lasted > 0.0) & (way > np.maximum(speed * lasted, spread))
         rested = (lasted > 0.0) & ~moved & (way + spread < _SEEN * speed * lasted)
-        if way_s == WAYS_S[0]:
+        if way_s == DISPLACEMENT_S[0]:
             moves = moved & (lasted <= way_s + wait_s)
         moved_s = np.fmax(moved_s, np.where(moved, time_s[before], np.nan))
         rests_s = np.fmax(rests_s, np.where(rested, time_s[before], np.nan))
@@ -234,7 +234,9 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
     return Evidence(*(a[alone] for a in (time_s, moves, moved_s, rests_s)))
 
 
-def ways(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def displacements(
+    lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Displacement north and east [m] of small differences of latitude and longitude [rad]."""
     square = 1.0 - E2 * np.sin(lat) ** 2
     across = A_M / np.sqrt(square)  # radius of curvature in the prime vertical

@@ -21,7 +21,7 @@ from robins.systems.ins_gnss.positions import (
     with_heading,
 )
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, at_rest, usual_of
+from robins.systems.ins_gnss.rest import DISPLACEMENT_S, UsualIntervals, at_rest, usual_of
 
 REST_S = 10.0  # after the first complete fix, within which a filter with a given heading levels
 UNKNOWN_SPEED = 10.0  # m/s, sigma of an unknown velocity
@@ -164,7 +164,7 @@ def find_start(
         if fast is None:
             q_nb = _carried(log, q_nb, at, _row(log, first), bias)
         return found._replace(q_nb=q_nb, v_n=log.v_n[first])
-    later = later[log.gnss_s[later] <= log.gnss_s[first] + WAYS_S[-1]]
+    later = later[log.gnss_s[later] <= log.gnss_s[first] + DISPLACEMENT_S[-1]]
     none = np.zeros(len(later), bool)
     stands = none if by_way else at_rest(log, aids, usual, log.gnss_s[later])[0]
     return _by_positions(log, found, at, later, stands, start, gnss, by_way)
@@ -270,10 +270,10 @@ def _by_positions(
     tilt, bias = level_.tilt_sigma_rad, level_.gyro_bias
     sure = np.isfinite(best_lines(log, later, tilt)[1]) & ~log.withheld[later]
     known = np.all(np.isfinite(v_n[later]), axis=1) | stands | sure
-    if not np.any(known) and log.time_s[-1] - log.gnss_s[later[0]] < WAYS_S[-1]:
+    if not np.any(known) and log.time_s[-1] - log.gnss_s[later[0]] < DISPLACEMENT_S[-1]:
         raise ValueError(
             f"the velocity at the start is not known: from {log.gnss_s[later[0]]:.1f} s on there "
-            f"are no three whole fixes within {WAYS_S[-1]:.0f} s, and no rest; give more of the log"
+            f"are no three whole fixes within {DISPLACEMENT_S[-1]:.0f} s, and no rest; give more of the log"
         )
     k = int(np.argmax(known))
     fix, own = int(later[k]), np.isfinite(v_n[later[k]])

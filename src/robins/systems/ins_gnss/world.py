@@ -32,7 +32,7 @@ from robins.sim.random import Component, stream
 from robins.sim.trajectory import MotionProfile
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, InsGnssImu
-from robins.systems.parts import ImuBlock, any_there, as_array, motion_of
+from robins.systems.parts import ImuBlock, as_array, may_be_nonzero, motion_of
 from robins.systems.study import Case
 
 
@@ -79,7 +79,7 @@ def receiver_model(drive: Drive) -> GnssErrorModel:
     return GnssErrorModel(
         sigma_m=as_array(g.sigma),
         sigma_v=as_array(g.velocity_sigma),
-        lever_b_m=as_array(g.lever_arm) if any_there(g.lever_arm) else None,
+        lever_b_m=as_array(g.lever_arm) if may_be_nonzero(g.lever_arm) else None,
         rate_hz=g.rate,
         time_offset_s=g.latency,
     )

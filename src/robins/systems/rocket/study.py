@@ -27,7 +27,7 @@ from robins.filters.rules import discriminator, gate, huber, only, strong_tracki
 from robins.filters.rules.discriminator import PUBLISHED
 from robins.results import array
 from robins.rotation import Rotation
-from robins.systems.aboard import Taken, filter_instruments, taken
+from robins.systems.aboard import Taken, filter_instruments, measurements_of
 from robins.systems.parts import NED
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
@@ -214,7 +214,7 @@ def angle_case(of: Taken, sigma: Array, world: RocketWorld) -> Case:
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
         u=field.bridged(world.theta_b).theta_b,
         truth=angle_state(world.q_nb[1:], world.omega_b[1:]),
-        **taken(of, world),
+        **measurements_of(of, world),
     )
 
 
@@ -289,7 +289,7 @@ def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: Roc
         u=field.bridged(world.theta_b),
         truth=FieldState(Rotation(q_nb), *errors),
         rows=field.rows_of(q_nb, field_n, len(sigma)),
-        **taken(of, world),
+        **measurements_of(of, world),
     )
 
 

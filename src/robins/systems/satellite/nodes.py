@@ -199,7 +199,7 @@ def star(
     """Frame of the star sensor at the end of a step."""
     if given.lens is None:
         return star_frame(row, before, read_star(q_ib, row.star_error))
-    looks = partial(_looks, given.lens, given.star_key)
+    looks = partial(_attitude_from_image, given.lens, given.star_key)
     found = jax.lax.cond(
         row.course.star.seen,
         looks,
@@ -226,7 +226,7 @@ def star_frame(
     return StarFrame(jnp.where(effect.seen, effect.factor * now, jnp.nan), factor, stars, now)
 
 
-def _looks(
+def _attitude_from_image(
     lens: CameraOptics, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number
 ):
     """Attitude from an image, the factor of its covariance, stars; NaN where these are too few."""

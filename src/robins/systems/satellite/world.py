@@ -99,7 +99,7 @@ def lay_out(given: AttitudeLoop) -> SatelliteCourse:
             field,
             jnp.asarray(_disturbance(given, np.asarray(middle.time_s))),
             jnp.asarray(works),
-            _star_says(given.star, due, time),
+            _star_sensor_faults(given.star, due, time),
             jnp.arange(count),
         ),
         due=due,
@@ -111,7 +111,7 @@ def lay_out(given: AttitudeLoop) -> SatelliteCourse:
             pinv=jnp.asarray(allocation_matrix(axes, left if wheels.loss_known else 1.0)),
             step_s=jnp.asarray(dt),
             quantum_rad=jnp.asarray(given.gyro.quantum),
-            lens=_lens(given.star),
+            lens=_camera_optics(given.star),
         ),
     )
 
@@ -122,7 +122,7 @@ def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Referen
     return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)
 
 
-def _lens(star: StarSensor) -> CameraOptics | None:
+def _camera_optics(star: StarSensor) -> CameraOptics | None:
     """The camera of a star sensor, if it has one, and the index of its stars."""
     if (given := star.camera) is None:
         return None
@@ -137,7 +137,7 @@ def _lens(star: StarSensor) -> CameraOptics | None:
     return CameraOptics(camera, index_for(camera, stars), jnp.asarray(given.tolerance))
 
 
-def _star_says(star: StarSensor, due: np.ndarray, time_s: np.ndarray) -> StarSensorFault:
+def _star_sensor_faults(star: StarSensor, due: np.ndarray, time_s: np.ndarray) -> StarSensorFault:
     seen, stuck = due & outside(star.lost, time_s), np.zeros(len(due), dtype=bool)
     turn, factor = np.zeros((len(due), 3)), np.ones(len(due))
     for fault in star.faults:

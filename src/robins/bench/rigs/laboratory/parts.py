@@ -151,24 +151,35 @@ _shows = jax.jit(partial(compiled_alone, _sky))
 
 
 def _sensor(
-    given: LoopConstants, vectors_s, magnitude, looks_q_ib, before, row: StepInputs
+    given: LoopConstants, vectors_s, magnitude, predicted_q_ib, before, row: StepInputs
 ) -> StarFrame:
     """Star sensor frame from the simulated stars; see `nodes.star`."""
     assert given.lens is not None
     solves = partial(_solves, given.lens, given.star_key)
     seen, number = row.course.star.seen, row.course.number
     found = jax.lax.cond(
-        seen, solves, nodes.closed_shutter, vectors_s, magnitude, looks_q_ib, row.star_error, number
+        seen,
+        solves,
+        nodes.closed_shutter,
+        vectors_s,
+        magnitude,
+        predicted_q_ib,
+        row.star_error,
+        number,
     )
     return nodes.star_frame(row, before, *found)
 
 
-def _solves(lens: CameraOptics, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
+def _solves(
+    lens: CameraOptics, star_key: Array, vectors_s, magnitude, predicted_q_ib, error, number
+):
     # Only the presence of a star counts here: the sensor identifies it.
     there = StarField(vectors_s, magnitude, jnp.where(jnp.isnan(magnitude), -1, 0))
     key = jax.random.fold_in(star_key, number)
     image = expose(key, turned(there, lens.camera, error), lens.camera)
-    return nodes.solved_attitude(*solve(image, lens.sky, lens.camera, looks_q_ib, lens.match_rad))
+    return nodes.solved_attitude(
+        *solve(image, lens.sky, lens.camera, predicted_q_ib, lens.match_rad)
+    )
 
 
 def _is_due(config: SatelliteConfig, step: int) -> bool:
@@ -242,10 +253,10 @@ def _move(
 
 
 def _look(
-    given: LoopConstants, q_ib: Array, looks_q_ib: Array, before: Array, row: StepInputs
+    given: LoopConstants, q_ib: Array, predicted_q_ib: Array, before: Array, row: StepInputs
 ) -> StarFrame:
     return compiled_alone(
-        _sensor, given, *compiled_alone(_sky, given, q_ib), looks_q_ib, before, row
+        _sensor, given, *compiled_alone(_sky, given, q_ib), predicted_q_ib, before, row
     )
 
 

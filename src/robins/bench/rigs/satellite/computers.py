@@ -67,7 +67,7 @@ def sample_of(gyro: Values | None) -> np.ndarray | None:
     return gyro["theta_b"]
 
 
-def late(part: Part, forgets: Callable[[StateT], StateT]) -> Part:
+def reset_if_late(part: Part, forgets: Callable[[StateT], StateT]) -> Part:
     """Wrap a part so that it resets its state if its first step is not the first of the run.
 
     The part has then lost power: determination waits for a star frame to start from, and control
@@ -189,7 +189,7 @@ def adm(config: SatelliteConfig) -> Part:
 
     takes = {"gyro": 0, "star": 0, "mode": 1}
     part = Part("adm", takes, lambda: begin, made.act, example, rare)
-    return late(part, lambda state: state._replace(lost=True))
+    return reset_if_late(part, lambda state: state._replace(lost=True))
 
 
 def _factor(config: SatelliteConfig, frame: Values) -> np.ndarray | None:
@@ -271,4 +271,4 @@ def acm(config: SatelliteConfig) -> Part:
 
     takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
     part = Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: precompile(config))
-    return late(part, lambda state: state._replace(estimate=stale(state.estimate)))
+    return reset_if_late(part, lambda state: state._replace(estimate=stale(state.estimate)))

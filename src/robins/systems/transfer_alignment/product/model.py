@@ -143,7 +143,7 @@ class _DelayedState(NamedTuple):
     gained_n: Array  # (3,) m/s, velocity gained by specific force since then
 
 
-def _then(at: Installation, x: ProductState, lag: RecordDelay) -> _DelayedState:
+def _state_at_validity(at: Installation, x: ProductState, lag: RecordDelay) -> _DelayedState:
     """State at the record's time of validity: (3), (4), (7), (8), (10)."""
     dt = jnp.asarray(lag.dt, float)
     ins, p = x.ins, x.ins.position
@@ -160,7 +160,7 @@ def _then(at: Installation, x: ProductState, lag: RecordDelay) -> _DelayedState:
 
 
 def _read_attitude(at: Installation, x: ProductState, lag: RecordDelay) -> Rotation:
-    return _then(at, x, lag).q_nm
+    return _state_at_validity(at, x, lag).q_nm
 
 
 def _arm_velocity(at: Installation, then: _DelayedState, lag: RecordDelay) -> Array:
@@ -171,13 +171,13 @@ def _arm_velocity(at: Installation, then: _DelayedState, lag: RecordDelay) -> Ar
 
 def _read_velocity(at: Installation, x: ProductState, lag: RecordDelay) -> Array:
     """Predicted velocity of the master, (5)."""
-    then = _then(at, x, lag)
+    then = _state_at_validity(at, x, lag)
     return then.v_n - _arm_velocity(at, then, lag)
 
 
 def _read_position(at: Installation, x: ProductState, lag: RecordDelay) -> Geodetic:
     """Predicted position of the master, (6) and (9)."""
-    then = _then(at, x, lag)
+    then = _state_at_validity(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
     back = 0.5 * (x.ins.v_n + then.v_n) * dt
     return x.ins.position.retract(-back - then.q_nm.apply(at.lever_m))
@@ -208,13 +208,13 @@ def _attitude_rows(
 
 
 def _linear_attitude(at: Installation, x: ProductState, lag: RecordDelay):
-    then = _then(at, x, lag)
+    then = _state_at_validity(at, x, lag)
     return then.q_nm, _attitude_rows(at, x, lag, then)
 
 
 def _linear_velocity(at: Installation, x: ProductState, lag: RecordDelay):
     """Predicted velocity (5) and its Jacobian, (12) where the delay is zero."""
-    then = _then(at, x, lag)
+    then = _state_at_validity(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
     free = frame_dynamics(x.ins)
     of_attitude = _attitude_rows(at, x, lag, then)

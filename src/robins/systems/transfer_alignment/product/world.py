@@ -42,7 +42,7 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.manoeuvres import MODERATE_SEA, BankedTurn, SeaMotion, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import MotionProfile, at_lever_arm
-from robins.systems.parts import any_there, as_array, outside, signed
+from robins.systems.parts import as_array, may_be_nonzero, outside, signed
 from robins.systems.parts import motion_of as driven
 from robins.systems.transfer_alignment.product.model import (
     RECORDS,
@@ -269,7 +269,7 @@ def start_estimate(run: PairRun) -> Nav:
 
 def _flexure(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Array, Array]:
     f = pair.flexure
-    if not any_there((*f.sigma, *f.bending)):
+    if not may_be_nonzero((*f.sigma, *f.bending)):
         stiff = jnp.zeros((len(course.dt) + 1, 3))
         return stiff, stiff
     load = jnp.asarray(course.load_factor)
@@ -291,7 +291,7 @@ def _slave_errors(pair: PairParameters, course: PairCourse, key: Array) -> tuple
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
     slow = (
         {"markov_sigma": as_array(s.gyro_slow), "markov_tau_s": as_array(s.gyro_slow_time)}
-        if any_there(s.gyro_slow)
+        if may_be_nonzero(s.gyro_slow)
         else {}
     )
     unit = ImuErrorModel(

@@ -253,7 +253,7 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, SlaveFlight]:
     return unpacked(path[K::K]), flight
 
 
-def as_master_sees(
+def corrected_by_master(
     own: Nav, flight: SlaveFlight, master: Nav
 ) -> tuple[SlaveFlight, Float[Array, "e 3 3"]]:
     """The slave's flight and attitudes, corrected by the reports of the master.

@@ -171,7 +171,7 @@ def simulate(
     # with the slave's mounting
     master_q = multiply(pair.master.q_nb.wxyz, jnp.asarray(course.pair.q_nominal))
     master = pair.master._replace(q_nb=Rotation(master_q))
-    flight, C_nb = va.as_master_sees(own, flown, master)
+    flight, C_nb = va.corrected_by_master(own, flown, master)
     assert pair.truth is not None
     return VelocityAttitudeWorld(
         pair=pair,
