@@ -6,7 +6,7 @@ the result stays outside of it, so that a bug of robins is not taken for a damag
 
 A declared size is compared with the bytes present before memory is allocated. An unpacked size may
 be up to `FREE` plus `RATIO` times the packed one: real logs compress 2 to 30 times, and data that
-compress better than `RATIO` are no measurements.
+compress better than `RATIO` are not measurements.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ A state is any pytree. Its leaves are arrays, which add, and *elements*: objects
 vector of a state stacks those of its leaves in pytree order. An element in a state is one, not
 many; many states are one state under `vmap`. An element whose arrays are not in the units of its
 tangent vector has ``units``, by array: texts for a reader of exported code. Without elements there
-is no overhead: `retract` is addition and `local` subtraction.
+is not an overhead: `retract` is addition and `local` subtraction.
 
     retract(x, local(x, y)) == y        local(x, retract(x, d)) == d
 """

@@ -40,7 +40,8 @@ def _folder() -> Iterator[int]:
         The descriptor.
 
     Raises:
-        RobinsError: it belongs to another user, others may access it, or it is no folder or a link.
+        RobinsError: it belongs to another user, others may access it, or it is not a folder or a
+            link.
     """
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     base = base if base.is_dir() else Path(tempfile.gettempdir())

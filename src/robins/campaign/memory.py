@@ -36,7 +36,7 @@ def width_of(bytes_of_run: int, most: int) -> int:
 
 
 def concurrent_chunks(bytes_of_run: int, width: int, cores: int) -> int:
-    """Number of chunks computed at once: one a core, as long as memory is left."""
+    """Number of chunks computed at once: one per core, as long as memory is left."""
     return max(1, min(cores, MEMORY // max(width * bytes_of_run, 1)))
 
 

@@ -141,7 +141,7 @@ class SensitivityRuns(NamedTuple):
 
         Returns:
             (blocks,) mean over the epochs that count of the squared length of the error, infinite
-            where the filter diverged, as `robins.campaign.Statistics` has it; and a number that
+            where the filter diverged, as in `robins.campaign.Statistics`; and a number that
             changes with the initial belief of the filter.
         """
         numbers: dict[Path, Any] = {}

@@ -37,7 +37,7 @@ class Statistics:
         n: tangent dimension of the filter's state, which may exceed the reported components.
         example: the record of the first run, for figures.
         sums: over the runs, arrays by name.
-        each: of every run, by name arrays with a leading axis of runs, one a chunk.
+        each: of every run, by name arrays with a leading axis of runs, one per chunk.
         bins: by block, tables of `robins.campaign.histogram`: lengths of the error at the epochs of
             `thinned`.
     """

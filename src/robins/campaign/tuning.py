@@ -122,7 +122,7 @@ def choose(
         names: (p,) of the parameters, for messages.
         chosen_on: at least `FEWEST_PARTS` parts.
         judged_on: other parts, of the same shapes.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         UndeterminedError: there are too few parts, a parameter changes nothing, runs away, or its

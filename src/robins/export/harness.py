@@ -2,7 +2,7 @@
 
 `make check` in the folder compiles library and test, replays the recorded inputs, and compares
 every output of every call with that of JAX: all fields of the state, the initial one included, and
-all fields of the result. Entry points that are no part of a step are called once, after the last
+all fields of the result. Entry points that are not part of a step are called once, after the last
 one. It also prints a checksum of the bits of all reals, by which two compilers or two machines are
 compared.
 """

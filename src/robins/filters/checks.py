@@ -42,7 +42,7 @@ def matrix(
 
     Raises:
         TypeError: it is not of real numbers.
-        ValueError: it is no matrix, of another shape or not finite; the message names the entry.
+        ValueError: it is not a matrix, of another shape or not finite; the message names the entry.
     """
     try:
         numbers = np.asarray(given)

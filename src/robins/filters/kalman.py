@@ -455,7 +455,7 @@ def kalman(
         form: "sqrt" (default, keeps full accuracy) or "joseph" (about 2.5 times faster at n = 15).
 
     Raises:
-        TypeError: linearise is no `Linearisation`, or rules is no sequence of rules.
+        TypeError: linearise is not a `Linearisation`, or rules is not a sequence of rules.
         ValueError: the form is neither "sqrt" nor "joseph".
     """
     one_of("form", form, Form)

@@ -132,7 +132,7 @@ def identify(
         most_chance: limit of the probability that the stars agree by chance.
 
     Returns:
-        The names, or the reason for none. Too few stars, or none that agree, are no error.
+        The names, or the reason for none. Too few stars, or none that agree, are not an error.
 
     Raises:
         ValueError: shapes that do not fit together, directions not of unit length (to 1e-3), a

@@ -219,7 +219,7 @@ def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def downdate(L: Float[Array, "n n"], v: Float[Array, "n"]) -> Float[Array, "n n"]:
-    """Lower factor of ``L L' - v v'``; all NaN if that is no covariance.
+    """Lower factor of ``L L' - v v'``; all NaN if that is not a covariance.
 
     Computed as ``L chol(I - p p')`` with L p = v: the subtraction is between numbers of order one
     however badly L is scaled, and L may be singular as long as v is in its range.

@@ -81,7 +81,7 @@ class ArrayProgram:
 
     Attributes:
         takes, makes: variables.
-        refused: the reason if they are no program.
+        refused: the reason if they are not a program.
     """
 
     def __init__(

@@ -4,7 +4,7 @@ A jaxpr is walked once for each row of a batch, each sigma point, each hypothesi
 each attempt of `robins.program.trace.with_preserved_zeros`. What a walk writes depends on the form
 of its arguments: which numbers are known, which nodes are the same, and what is negated or tested
 to be finite. It may also depend on how arguments are computed from one another: if one is the sine
-of another, and the jaxpr takes that sine too, both are one node. Such a call is no template for
+of another, and the jaxpr takes that sine too, both are one node. Such a call is not a template for
 others.
 """
 
@@ -117,7 +117,7 @@ def drop_templates(calls: Calls, graphs: Sequence[Graph]) -> None:
 
 
 def _form(graph: Graph, args: Sequence[Nodes]) -> tuple[Hashable, list[Node]]:
-    """Form of some arguments, and the nodes among them that are no known numbers."""
+    """Form of some arguments, and the nodes among them that are not known numbers."""
     place: dict[Node, int] = {}
     form: list[Hashable] = [a.shape for a in args]
     ahead = [n for a in args for n in a.ravel().tolist()]

@@ -182,7 +182,7 @@ class AxisLoop:
     Attributes:
         equations: in an order of computation.
         is_worth: whether it is worth the time of a compiler.
-        refused: the reason if they are no program.
+        refused: the reason if they are not a program.
         nodes: number of nodes of its program, if it is interpreted.
     """
 

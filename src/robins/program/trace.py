@@ -65,7 +65,7 @@ def trace_step(
         unroll: as in `trace`.
 
     Raises:
-        ProgramError: as in `trace`; or the first result is no state.
+        ProgramError: as in `trace`; or the first result is not a state.
     """
     return trace_steps([(function, args)], state, unroll=unroll)[0]
 

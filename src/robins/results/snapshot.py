@@ -75,8 +75,8 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
     """Read a snapshot written by the class `kind`.
 
     Raises:
-        ResultError: the file cannot be read, is no snapshot, is damaged, or is of another version
-            or class.
+        ResultError: the file cannot be read, is not a snapshot, is damaged, or is of another
+            version or class.
     """
     try:
         with open(path, "rb") as file:

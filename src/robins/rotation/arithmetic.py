@@ -86,7 +86,7 @@ def rotate(q: Float[Real, "*#b 4"], v: Float[Real, "*#b 3"]) -> Float[Real, "*b 
     """Rotate vectors; with q_nb, body components become navigation components.
 
     Raises:
-        ValueError: q is no unit quaternion (to 0.05; compiled code does not check the norm).
+        ValueError: q is not a unit quaternion (to 0.05; compiled code does not check the norm).
     """
     _refuse_no_quaternion(q)
     xp = library(q, v)
@@ -129,7 +129,7 @@ def from_dcm(C: Float[Real, "*b 3 3"]) -> Float[Real, "*b 4"]:
     Shepperd's method divides by the largest of the four components, so no case is ill-conditioned.
 
     Raises:
-        ValueError: C is no rotation: a reflection, or not orthogonal to 0.05. In compiled code,
+        ValueError: C is not a rotation: a reflection, or not orthogonal to 0.05. In compiled code,
             which cannot raise, a reflection gives NaN.
     """
     shape = np.shape(C)
@@ -153,7 +153,9 @@ def from_dcm(C: Float[Real, "*b 3 3"]) -> Float[Real, "*b 4"]:
 
 
 def _refuse_no_rotation(C: Real) -> Real:
-    """Refuse a matrix that is no rotation; the mask of reflections if it is traced, else None."""
+    """Refuse a matrix that is not a rotation; return the mask of reflections if it is traced, else
+    None.
+    """
     if is_traced(C):
         jnp = library(C)
         return jnp.sum(jnp.cross(C[..., 0, :], C[..., 1, :]) * C[..., 2, :], axis=-1) <= 0.0

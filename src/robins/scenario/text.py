@@ -36,8 +36,8 @@ def read_text(path: str | Path) -> str:
     """Text of a scenario file.
 
     Raises:
-        ScenarioError: the file cannot be read, is no UTF-8 text, is longer than a megabyte, or is
-            not TOML; the message names the file.
+        ScenarioError: the file cannot be read, is not a UTF-8 text, is longer than a megabyte, or
+            is not TOML; the message names the file.
     """
     try:
         with Path(path).open("rb") as file:

@@ -61,7 +61,7 @@ class ListedScenario(NamedTuple):
 def listed(system: str) -> dict[str, ListedScenario]:
     """Packaged scenarios of a system by name, grouped by study.
 
-    A file of its folder without a number of runs configures a replay and is no scenario.
+    A file of its folder without a number of runs configures a replay and is not a scenario.
 
     Args:
         system: name; a system without a folder `scenarios` has none.

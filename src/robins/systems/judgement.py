@@ -175,7 +175,7 @@ def interval_of(
             runs, each once. Each filter has the number of runs under `RUNS`.
 
     Returns:
-        Lower and upper end; None: there are no draws, or the value is no function of figures of
+        Lower and upper end; None: there are no draws, or the value is not a function of figures of
         single runs.
     """
     if not drawn or not isinstance(value, int | float) or not math.isfinite(value):

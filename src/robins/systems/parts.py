@@ -87,7 +87,7 @@ def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
 
 
 def during(spans: Sequence[Span | None], time_s: np.ndarray) -> np.ndarray:
-    """Mask (N,) of the times (N,) that lie in any of the spans; None is no span."""
+    """Mask (N,) of the times (N,) that lie in any of the spans; None for no spans."""
     return ~outside([span for span in spans if span is not None], time_s)
 
 

@@ -1,4 +1,4 @@
-"""Functions behind the commands: one a command, from its arguments to an `Outcome`.
+"""Functions behind the commands: one per command, from its arguments to an `Outcome`.
 
 ::
 

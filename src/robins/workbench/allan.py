@@ -160,7 +160,7 @@ def allan(
         log: a file in any format of `robins.logs` with inertial samples.
         terms: noises to fit, of Q, N, B, K, R.
         columns: TOML files that declare formats of the file, see `robins.logs.columns_from`.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError: the terms are not among these letters, or the log is too short, uneven or

@@ -63,7 +63,7 @@ def bench_up(
         host: of the page.
         port: of the page.
         opened: called with the address of the page.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
         **options: fields of `robins.bench.run.setup.Setup` that take the place of the scenario's;
             None leaves one as it is.
 
@@ -188,7 +188,7 @@ def bench_replay(
         node: name of the part.
         filter_: another filter for it to run.
         diff: another record to compare with, in place of running the part.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError, robins.scenario.ScenarioError: no such part or filter, or both are given.

@@ -50,7 +50,7 @@ def bound(
         without: sensors to leave out altogether.
         at: times to report, such as "200 s"; by default the quarters.
         settings: "path=value" texts that change the scenario.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError, robins.scenario.ScenarioError, robins.units.UnitError: the request cannot be

@@ -215,7 +215,7 @@ def calibrate(
         end: use samples up to "80 s" after the first one.
         horizontal: the vehicle turned about the vertical only; its z axis is not calibrated.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError: the log cannot be calibrated with; the sentence gives the reason.

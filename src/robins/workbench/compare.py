@@ -59,7 +59,7 @@ def compare(
     A metric that differs is shown with the ratio of the second to the first, by component.
 
     Raises:
-        robins.results.ResultError: one of them is no result folder, or is damaged.
+        robins.results.ResultError: one of them is not a result folder, or is damaged.
     """
     a, b = results.read(first), results.read(second)
     told = [
@@ -99,7 +99,7 @@ def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
 
 
 def ratios(pair: Sequence[Any]) -> list[float]:
-    """The second over the first, of each component; NaN where one is no number."""
+    """The second over the first, of each component; NaN where one is not a number."""
     a, b = (np.atleast_1d(np.array(Probability.share_of(x), dtype=object)) for x in pair)
     if a.shape != b.shape:
         return [float("nan")]
@@ -154,8 +154,8 @@ def verify(where: Annotated[Where, Option(metavar="FOLDER")]) -> dict[str, Any]:
         ``scenario``, ``files`` (how many), ``whole``.
 
     Raises:
-        robins.results.ResultError: it is no result folder, incomplete or damaged; the message names
-            the file.
+        robins.results.ResultError: it is not a result folder, incomplete or damaged; the message
+            names the file.
     """
     found = results.read(where)
     return {

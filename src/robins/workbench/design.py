@@ -202,7 +202,7 @@ def design(
         given: the path of a problem, or the name of an example.
         gamma: bounds on the H-infinity norm, "1, 0.8"; by default those of the problem, or a range.
         methods: to compare; by default all.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError: the problem, a gamma or a method cannot be used.

@@ -35,7 +35,7 @@ def inventory(system: Annotated[str | None, Option(metavar="[SYSTEM]")] = None) 
     With --json it prints everything, or SYSTEM alone.
 
     Args:
-        system: its name, or "file.py:study"; "bench", or a rig that is no system: the bench; all
+        system: its name, or "file.py:study"; "bench", or a rig that is not a system: the bench; all
             where not given.
 
     Raises:

@@ -30,7 +30,7 @@ def publishing(
     Args:
         out: the folder.
         command: how to make the result again, for its report.
-        progress: called with the share done and what is being done while it is written.
+        progress: called with the fraction done and the current activity while it is written.
         timeout_s: how long to wait for another writer of the folder.
 
     Yields:

@@ -76,7 +76,7 @@ def replay(
         exports: formats of other programs, of `robins.workbench.formats.FORMATS`; the files are
             among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
         findings: called with the findings of the doctor.
 
     Raises:

@@ -55,7 +55,7 @@ def run(
             default of its system.
         settings: "path=value" texts that change the scenario.
         machine: "vm", "c" or "jax"; not given, the interpreter where it can be.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError, robins.scenario.ScenarioError: the request cannot be run.
@@ -106,7 +106,7 @@ def demo(
     Args:
         runs: how many.
         filters: names; by default those on which the claims of the scenario are judged.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError: there is no such filter.

@@ -113,7 +113,7 @@ def sensitivity(
         samples: a power of two; there are ``samples * (parameters + 2)`` points.
         seed: of the random streams and of the points.
         settings: "path=value" texts that change the scenario.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
 
     Raises:
         InputError, robins.scenario.ScenarioError: the request cannot be computed.

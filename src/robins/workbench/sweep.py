@@ -115,10 +115,10 @@ def sweep(
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
         where: a folder, or an address of object storage.
         vary: one or two texts ``key=a,b,c``.
-        workers: processes; by default one a core.
+        workers: processes; by default one per core.
         machine: as for `plan_campaign`.
         settings: "path=value" texts that change the scenario at all points.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
         **options: runs, seed and filters, as for `plan_campaign`.
 
     Raises:

@@ -73,7 +73,7 @@ def tune(
 
     Args:
         names: a scenario, "system/name", a TOML file or "file.py:study"; or the files of a log.
-        vary: texts ``key``, or ``key=value`` to begin elsewhere, one a parameter.
+        vary: texts ``key``, or ``key=value`` to begin elsewhere, one per parameter.
         filter_name: of the filter; by default the first of the scenario or system.
         runs: simulated runs to choose on; as many others to judge on.
         seed: of the random streams.
@@ -83,7 +83,7 @@ def tune(
         system: of a log.
         settings: "path=value" texts that change scenario and filter beforehand.
         columns: TOML files that declare formats of the log's files.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current activity.
         findings: called with the doctor's findings on a log.
 
     Raises:

@@ -54,7 +54,7 @@ def varied(texts: Sequence[str], parameters: Any, text: str) -> list[TunedParame
 
     Raises:
         InputError: none is named, or one twice.
-        robins.scenario.ScenarioError: there is none, or it is no number.
+        robins.scenario.ScenarioError: there is none, or it is not a number.
     """
     if not texts:
         raise InputError("nothing to tune", "--vary", "name a parameter, as --vary imu.gyro_noise.")

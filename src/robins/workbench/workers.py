@@ -102,8 +102,8 @@ def campaign_run(
     Args:
         where: a folder, or an address of object storage.
         name: of the scenario.
-        workers: processes; by default one a core.
-        progress: called with the share done and what is being done.
+        workers: processes; by default one per core.
+        progress: called with the fraction done and the current activity.
         **options: of `plan_campaign`.
     """
     progress(0.0, "looking what is there")

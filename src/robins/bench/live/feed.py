@@ -50,8 +50,8 @@ def check(signals: Sequence[Signal]) -> None:
 
     Raises:
         ValueError: there are none, two of one name, a plot of two units, an unknown role, a sigma
-            of something that is no value of the same plot, an attitude that is not four signals of
-            a plot of attitudes, or an `of` where there is neither.
+            of something that is not a value of the same plot, an attitude that is not four signals
+            of a plot of attitudes, or an `of` where there is neither.
     """
     if not signals:
         raise ValueError("a live page needs at least one signal")
@@ -141,7 +141,7 @@ def to_json(value: Any) -> str:
     """JSON that every browser reads: numbers that are not finite become null.
 
     Raises:
-        TypeError: something in it is no number, text, list or mapping.
+        TypeError: something in it is not a number, text, list or mapping.
     """
     return json.dumps(_plain(value), allow_nan=False, separators=(",", ":"))
 

@@ -132,7 +132,7 @@ class LivePage(Closing):
         """Show the state of the bench, in place of the one before; docs/live.md lists the keys.
 
         Raises:
-            TypeError: something in it is no number, text, list or mapping.
+            TypeError: something in it is not a number, text, list or mapping.
         """
         self._last_status = self._status = feed.to_json(status).encode()
         self._pump()

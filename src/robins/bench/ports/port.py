@@ -46,7 +46,8 @@ def address(text: str) -> Address:
     """Parse an address: ``/dev/ttyUSB0,460800``, or ``/dev/ttyUSB0`` for 460800 baud.
 
     Raises:
-        PortError: the speed is no number, or the path is none, is no port, or may not be opened.
+        PortError: the speed is not a number, or the path is none, is not a port, or may not be
+            opened.
     """
     path, comma, speed = text.strip().rpartition(",")
     if not comma:

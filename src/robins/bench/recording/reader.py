@@ -62,7 +62,7 @@ def read_record(path: str | Path) -> Record:
     Of a truncated or damaged file, the entries before the damage are read; `why` has the reason.
 
     Raises:
-        RecordingError: there is no such file, it is no record of the bench, it is of another
+        RecordingError: there is no such file, it is not a record of the bench, it is of another
             version of the wire, or it ends within the header of the run.
     """
     return _read(Path(path), lambda reader: reader.entries)

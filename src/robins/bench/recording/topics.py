@@ -134,7 +134,7 @@ class Topics:
             self._by_number.setdefault(number, []).append((row, _schema(row, wire.message(number))))
 
     def of(self, entry: Entry) -> list[ConvertedMessage]:
-        """Messages that the rows make of an entry; none if it is no valid frame."""
+        """Messages that the rows make of an entry; none if it is not a valid frame."""
         if not self._by_number or entry.direction != "from" or len(entry.data) < 2:
             return []
         try:

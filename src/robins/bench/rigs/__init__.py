@@ -22,7 +22,7 @@ RIGS: tuple[str, ...] = ("satellite", "ins-gnss", "airship", "laboratory", "mult
 
 
 class UnknownRig(RobinsError, ValueError):
-    """A name that is no rig, or an object that is none."""
+    """A name that is not a rig, or an object that is none."""
 
 
 def rig_of(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> Rig:

@@ -51,7 +51,7 @@ class RealTime:
         """Set the clock.
 
         Args:
-            rate_hz: steps a second.
+            rate_hz: steps per second.
             overrun: what to do when a step is not over at the next one's deadline.
             timeout_periods: periods for which a part is waited for.
         """

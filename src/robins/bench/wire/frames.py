@@ -2,7 +2,7 @@
 
     0x00 COBS(version u8 | type u8 | run u32 | sequence u32 | time u64 | payload | CRC-32C u32) 0x00
 
-Little endian; the check goes over all before it (Castagnoli's polynomial, as iSCSI has it). COBS
+Little endian; the check goes over all before it (Castagnoli's polynomial, as in iSCSI). COBS
 (Cheshire & Baker 1999) takes every zero out for one byte in 254, so a zero is always the edge of a
 frame. There is one at *both* ends: after noise the opening zero ends the noise, and a frame that
 lost its closing zero ends at the next one's opening, so damage to one frame never costs another.
@@ -77,8 +77,8 @@ def decode_frame(stuffed: bytes) -> Frame:
         stuffed: what lies between them, without them.
 
     Raises:
-        FrameError: it is no frame: invalid stuffing ("cobs"), too short, too long, a wrong checksum
-            ("crc"), or another version.
+        FrameError: it is not a frame: invalid stuffing ("cobs"), too short, too long, a wrong
+            checksum ("crc"), or another version.
     """
     try:
         body = cobs.decode(stuffed)

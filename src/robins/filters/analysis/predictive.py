@@ -1,7 +1,7 @@
 """Predictive score of a filter: the log density of each measurement, before it is used.
 
 The density is that of the belief alone, before rules refuse or weigh the measurement, so that
-filters of any kind can be compared, and refusing more measurements is no advantage.
+filters of any kind can be compared, and refusing more measurements is not an advantage.
 """
 
 from __future__ import annotations

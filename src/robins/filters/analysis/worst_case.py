@@ -257,8 +257,8 @@ def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Ste
 
     Raises:
         TypeError: a matrix is not of real numbers.
-        ValueError: a matrix is of another shape or not finite, Q or R is no covariance, or there is
-            no steady state, with the reason.
+        ValueError: a matrix is of another shape or not finite, Q or R is not a covariance, or there
+            is no steady state, with the reason.
     """
     # Imported here to keep designs out of the imports of filters.
     from robins.filters.synthesis import current_form, kalman_gain

@@ -161,7 +161,7 @@ def adaptive(
             (`huber`); None never recovers.
 
     Raises:
-        ValueError: scales do not rise from above zero; up or back is no probability. When a run
+        ValueError: scales do not rise from above zero; up or back is not a probability. When a run
             starts: the model has no sensor of a name in `off`.
     """
     s = np.asarray(scales, float)

@@ -69,8 +69,8 @@ def channel_inflation(lambda_: Number, B: Given | Callable[[State], ArrayLike]) 
             such a matrix; the mean is the predicted one.
 
     Raises:
-        ValueError: lambda is negative or not finite, B is no matrix or not finite; at `init`, B has
-            another number of rows than the state has components.
+        ValueError: lambda is negative or not finite, B is not a matrix or not finite; at `init`, B
+            has another number of rows than the state has components.
     """
     negative = "channel_inflation lambda must be a number from 0 on"
     size = number(negative, lambda_, lambda x: (x >= 0.0) & (x < np.inf))

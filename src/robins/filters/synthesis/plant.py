@@ -60,8 +60,8 @@ def plant(
 
     Raises:
         TypeError: a block is not made of real numbers.
-        ValueError: a block is no matrix, has the wrong shape or is not finite, or a mode that does
-            not decay is unobservable in y. The message names the block or the mode.
+        ValueError: a block is not a matrix, has the wrong shape or is not finite, or a mode that
+            does not decay is unobservable in y. The message names the block or the mode.
     """
     A, Bw, Bn, C = (matrix(*one) for one in (("A", A), ("Bw", Bw), ("Bn", Bn), ("C", C)))
     n, m = A.shape[0], C.shape[0]

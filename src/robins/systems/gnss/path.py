@@ -48,7 +48,7 @@ class GnssPath:
         way_m: along the road since the first epoch.
         fix: (4 + K,) of `first_fix`, of the first epoch.
         dropped: pseudoranges without a column, because all of their system were in use.
-        without_fix: epochs with satellites enough whose first fix is no place on the Earth.
+        without_fix: epochs with satellites enough whose first fix is not a place on the Earth.
     """
 
     def __init__(

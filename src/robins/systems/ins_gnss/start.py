@@ -71,7 +71,7 @@ def _compass(
 ) -> tuple[float, str]:
     """Heading [rad] by the magnetometer within a second of a time, and a sentence.
 
-    The declination is that of the World Magnetic Model, for 2025 if the stamps are no date.
+    The declination is that of the World Magnetic Model, for 2025 if the stamps have no date.
 
     Args:
         log: with a magnetometer.
@@ -273,7 +273,8 @@ def _by_positions(
     if not np.any(known) and log.time_s[-1] - log.gnss_s[later[0]] < DISPLACEMENT_S[-1]:
         raise ValueError(
             f"the velocity at the start is not known: from {log.gnss_s[later[0]]:.1f} s on there "
-            f"are no three whole fixes within {DISPLACEMENT_S[-1]:.0f} s, and no rest; give more of the log"
+            f"are no three whole fixes within {DISPLACEMENT_S[-1]:.0f} s, and no rest; "
+            "give more of the log"
         )
     k = int(np.argmax(known))
     fix, own = int(later[k]), np.isfinite(v_n[later[k]])

@@ -1,7 +1,7 @@
 """Parameters of a spinning rocket in free flight, with units.
 
 Two studies share the flight, the body, the gyro and the disturbances of the magnetometer: in
-"magnetic-attitude" the magnetometer reports three angles, as the paper has it; in "field-vector" it
+"magnetic-attitude" the magnetometer reports three angles, as in the paper; in "field-vector" it
 reports the field, and the gyro drives the motion.
 """
 

@@ -2,8 +2,8 @@
 
 The paper's filter is "federated-vector-stukf": two local unscented filters, for gyro and
 magnetometer, each with strong tracking in its simplified (lumped) form; shares by the observability
-of each state; information shared as A^-1/2 P A^-1/2 ("half"), with a reset at every step. It is no
-upper bound (`robins.filters.federated`), hence the warning that is silenced here: the study is
+of each state; information shared as A^-1/2 P A^-1/2 ("half"), with a reset at every step. It is not
+an upper bound (`robins.filters.federated`), hence the warning that is silenced here: the study is
 about it.
 """
 

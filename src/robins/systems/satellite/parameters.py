@@ -109,7 +109,7 @@ class StarFault(Span):
     """Fault of the star sensor, from begin (included) to end (excluded).
 
     "stuck": its last report repeated; "turned": an attitude rotated about its boresight; "sign": in
-    every other second the same attitude with the opposite sign, which is no fault of the sensor;
+    every other second the same attitude with the opposite sign, which is not a fault of the sensor;
     "short": a quaternion whose length is not one.
     """
 

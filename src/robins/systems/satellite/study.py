@@ -247,7 +247,7 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Masks (E,) of the epochs at which gyro and star sensor differ from the filters' model.
 
-    Noise, modelled drift and false stars are no faults.
+    Noise, modelled drift and false stars are not faults.
     """
     g, star, believed = given.gyro, given.star, given.believed.drift
     true = equivalent_walk(g.rate_walk, g.markov, g.markov_time)

@@ -91,7 +91,7 @@ class DeterminationState(NamedTuple):
 
 
 class _Determination:
-    """The filter and the functions around it, compiled or interpreted as the config has it."""
+    """The filter and the functions around it, compiled or interpreted as the config requires."""
 
     def __init__(self, config: SatelliteConfig):
         self.config, self.form = config, config.form
