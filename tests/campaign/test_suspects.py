@@ -11,7 +11,7 @@ from robins.filters import Belief, Model, Motion, Sensor, adaptive
 from robins.report.suspects import suspects
 from robins.results.roles import fault
 from robins.systems.study import Case, Contender, Problem, SensorAxes, StateBlock
-from robins.systems.suspects import sentences, spans, tables
+from robins.systems.suspects import probability_array, sentences, spans
 
 EPOCHS, RUNS = 60, 3
 TIME = 0.5 * np.arange(1, EPOCHS + 1)
@@ -134,9 +134,9 @@ def test_sentences_name_the_longest_times_and_tables_leave_gaps():
         "bank suspects imu: 0.0 to 8.0 s; probability up to 0.85."
     ]
     assert spans(time, chance > 0.5)[:2] == [(3.0, 3.0), (10.0, 12.0)]
-    table = tables("wrong", [{}, {"imu": chance}, {"gyro": chance}])["wrong"]
+    table = probability_array("wrong", [{}, {"imu": chance}, {"gyro": chance}])["wrong"]
     assert table.shape == (3, 100, 2)
     assert np.all(np.isnan(table.values[0]))
     np.testing.assert_array_equal(table.values[2, :, 1], chance)
     assert np.all(np.isnan(table.values[1, :, 1]))
-    assert tables("wrong", [{}, {}]) == {}
+    assert probability_array("wrong", [{}, {}]) == {}

@@ -383,7 +383,7 @@ def unlocked(monkeypatch):
 
 def test_without_locks_the_last_of_two_writers_stands(earlier, monkeypatch):
     unlocked(monkeypatch)
-    unknown = folder._hidden(earlier, "new")
+    unknown = folder._hidden_name(earlier, "new")
     unknown.mkdir()
     first = ResultWriter(earlier)
     first.save_summary(a_summary(seed=2))
@@ -411,7 +411,7 @@ def test_a_writer_that_is_overtaken_in_the_exchange_tries_again(earlier, monkeyp
 
 
 def test_what_a_dead_writer_set_aside_is_read_and_brought_back(earlier):
-    aside = folder._hidden(earlier, "old")
+    aside = folder._hidden_name(earlier, "old")
     earlier.rename(aside)
     assert read(earlier).summary["seed"] == 1
     assert read(earlier).path == aside
@@ -422,8 +422,8 @@ def test_what_a_dead_writer_set_aside_is_read_and_brought_back(earlier):
 
 
 def test_hidden_folders_of_others_are_not_touched(earlier):
-    other = folder._hidden(earlier.with_name("other"), "new")
-    looks_alike = earlier.parent / f"{folder._hidden(earlier, 'new').name}.backup"
+    other = folder._hidden_name(earlier.with_name("other"), "new")
+    looks_alike = earlier.parent / f"{folder._hidden_name(earlier, 'new').name}.backup"
     other.mkdir()
     looks_alike.mkdir()
     write(earlier, a_summary())

@@ -15,7 +15,7 @@ from robins.campaign import simulate
 from robins.manifold import Angle
 from robins.scenario import Quantity, default
 from robins.sim.random import stream
-from robins.systems.from_model import drawn
+from robins.systems.from_model import draw_run
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "first.py"
 F = np.array([[1.0, 1.0], [0.0, 1.0]])
@@ -31,14 +31,14 @@ def start(factor: float = 1.0) -> rb.Belief:
 
 
 def test_without_noise_the_world_is_the_motion():
-    truth, y = drawn(model(), start(0.0), 4, partial(stream, 1, 0))
+    truth, y = draw_run(model(), start(0.0), 4, partial(stream, 1, 0))
     np.testing.assert_array_equal(truth, [[3, 2], [5, 2], [7, 2], [9, 2]])
     np.testing.assert_array_equal(y["a"], truth[:, :1])
 
 
 def test_its_covariances_are_those_of_the_model():
     """Scatter of a variance over 4000 runs: a share of 1/sqrt(2000)."""
-    runs = jax.vmap(lambda k: drawn(model(0.5, 3.0), start(2.0), 2, partial(stream, 7, k)))
+    runs = jax.vmap(lambda k: draw_run(model(0.5, 3.0), start(2.0), 2, partial(stream, 7, k)))
     truth, y = runs(jnp.arange(4000))
     P, Q = 4.0 * np.eye(2), 0.25 * np.eye(2)
     for k in range(2):
@@ -51,7 +51,7 @@ def test_readings_may_be_elements_of_a_manifold():
     turned = rb.Sensor(lambda x, aux: Angle(x[0]), jnp.array([0.1]), name="turned")
     held = rb.Model(rb.Motion(lambda x, u: x, jnp.zeros(1)), (turned,))
     nearly = rb.Belief(jnp.array([np.pi]), jnp.zeros((1, 1)))
-    _, y = drawn(held, nearly, 50, partial(stream, 0, 0))
+    _, y = draw_run(held, nearly, 50, partial(stream, 0, 0))
     assert np.all(np.abs(y["turned"].rad) <= np.pi)
     assert np.abs(y["turned"].rad).min() > 2.5
 

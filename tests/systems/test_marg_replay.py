@@ -14,7 +14,7 @@ from robins.ins.increments import from_imu
 from robins.systems.marg import MargReplay, filter_of, model_of, prepare, replay
 from robins.systems.marg.log import at_samples
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL
-from robins.systems.marg.path import MeasurementPace, as_means
+from robins.systems.marg.path import MeasurementPace, as_increments
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
 PARAMETERS = MargReplay()
@@ -285,7 +285,7 @@ def test_lost_means_are_bridged_by_a_straight_line():
     end = np.delete(np.arange(1, 101), np.arange(40, 70)) * 0.01
     ramp = np.outer(end - 0.005, [0.0, 0.0, 2.0])  # mean over the interval before each stamp
     log = ImuTable(np.round(end * 1e9).astype(np.int64), ramp, ramp - [0.0, 0.0, 9.8], "rate")
-    inc, _ = from_imu(as_means(log))
+    inc, _ = from_imu(as_increments(log))
     np.testing.assert_allclose(inc.theta.sum(0)[2], end[-1] ** 2 - end[0] ** 2, rtol=1e-9)
 
 

@@ -38,7 +38,7 @@ class MessageSeries(Mapping[str, np.ndarray]):
     arrays: Mapping[str, np.ndarray]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """A field."""
+        """Values of a field, leading axis E."""
         return self.arrays[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -154,7 +154,7 @@ _LINE_FAULTS: tuple[tuple[str, str, dict[str, float]], ...] = (
 _AXES, _WXYZ = "xyz", "wxyz"
 
 
-def drawn(messages: Sequence[Message]) -> list[tuple[Message, Field]]:
+def plottable(messages: Sequence[Message]) -> list[tuple[Message, Field]]:
     """Fields that can be plotted, each with its message."""
     return [(m, f) for m in messages for f in m.fields if f.kind == "f64"]
 
@@ -168,7 +168,7 @@ def axes_of(f: Field) -> list[str]:
 
 def view_of(messages: Sequence[Message]) -> PageView:
     """Default page: a plot of every number."""
-    fields = drawn(messages)
+    fields = plottable(messages)
     names = [f"{m.name}.{f.name}" for m, f in fields]
 
     def signals(given: Any) -> list[Signal]:
@@ -233,7 +233,7 @@ def figures_of(metrics: Mapping[str, float | int | None]) -> list[str]:
 def arrays_of(messages: Sequence[Message], series: MessageSeries) -> dict[str, xr.Variable]:
     """Every number as an array of the solution, with its unit."""
     out: dict[str, xr.Variable] = {}
-    for m, f in drawn(messages):
+    for m, f in plottable(messages):
         values = series[f"{m.name}.{f.name}"].reshape(1, len(series.time_s), f.length)
         about = {"unit": f.unit, "long_name": f"{m.name}: {f.name}", "comment": f.text}
         out |= array("value", values, f"{m.name}_{f.name}", axes=axes_of(f), frame=m.name, **about)

@@ -27,7 +27,7 @@ from robins.results import (
 )
 from robins.systems.judgement import RUNS, Metrics, Verdicts
 from robins.systems.study import Contender, Problem, StateBlock
-from robins.systems.suspects import sentences, tables, words
+from robins.systems.suspects import probability_array, sentences, words
 from robins.systems.tables import block_array, innovation_tables
 
 
@@ -290,13 +290,13 @@ def _scatter(b: StateBlock, found: dict[str, Statistics]) -> Variables:
 
 def _fault_probabilities(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Variable]:
     """Fault probability of each suspect, in the first run and over all runs, and the truth."""
-    data = tables("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
+    data = probability_array("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
     if not data:
         return {}
     runs = next(iter(found.values())).runs
     if runs > 1:
         mean = [{name: s.wrong(name) for name in s.suspects} for s in found.values()]
-        data |= tables("mean_wrong", mean, runs=runs)
+        data |= probability_array("mean_wrong", mean, runs=runs)
     if problem.faults is not None:
         none = np.zeros(len(problem.epoch_s), bool)
         true = [problem.faults.get(str(name), none) for name in data["suspect"].values]

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from types import FrameType
 
 # Functions whose exceptions Python ignores; JAX adds the first to every garbage collection.
-_DEAF = frozenset({"_xla_gc_callback", "__del__"})
+_SWALLOWING = frozenset({"_xla_gc_callback", "__del__"})
 _AGAIN_S = 0.05
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 
@@ -23,7 +23,7 @@ _asked = False
 
 def _swallows_interrupts(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_code.co_name in _DEAF:
+        if frame.f_code.co_name in _SWALLOWING:
             return True
         frame = frame.f_back
     return False

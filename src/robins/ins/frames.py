@@ -96,11 +96,11 @@ def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
         if side in turns and getattr(table, name, None) is not None
     }
     if isinstance(table, Trajectory | AttitudeTable):
-        new["q_nb"] = _turned(table.q_nb, "nav" in turns, "body" in turns)
+        new["q_nb"] = _swapped_axes(table.q_nb, "nav" in turns, "body" in turns)
     return replace(table, **targets, **new)
 
 
-def _turned(q, turn_nav: bool, turn_body: bool):
+def _swapped_axes(q, turn_nav: bool, turn_body: bool):
     """Attitudes with the axes of one side, of both, or of none exchanged."""
     if turn_nav and turn_body:
         return swap_q(q)

@@ -182,8 +182,8 @@ def _integrate(h, rate, force):
     theta = 0.5 * h * (w1 + w2) + np.sqrt(3.0) / 12.0 * h**2 * _cross(w1, w2)
     # Rotation vectors at the points: integrals of the line through both rates (Gauss-Legendre).
     early, late = 0.25 - np.sqrt(3.0) / 6.0, 0.25 + np.sqrt(3.0) / 6.0
-    u1 = _turned(h * (0.25 * w1 + early * w2), f1)
-    u2 = _turned(h * (late * w1 + 0.25 * w2), f2)
+    u1 = _rotated(h * (0.25 * w1 + early * w2), f1)
+    u2 = _rotated(h * (late * w1 + 0.25 * w2), f2)
     dv = 0.5 * h * (u1 + u2)
     dr = 0.5 * h**2 * ((1.0 - _GAUSS[0]) * u1 + (1.0 - _GAUSS[1]) * u2)
     return theta, dv, dr
@@ -194,7 +194,7 @@ def _cross(a, b):
     return a[..., _YZX] * b[..., _ZXY] - a[..., _ZXY] * b[..., _YZX]
 
 
-def _turned(phi, v):
+def _rotated(phi, v):
     """Rotate vectors v by rotation vectors phi (Rodrigues)."""
     sq = np.einsum("ni,ni->n", phi, phi)[:, None]
     # sin(p)/p and (1 - cos(p))/p^2; np.sinc(x) is sin(pi x)/(pi x), with its limit at 0

@@ -12,7 +12,7 @@ from robins.results import find
 
 @style.styled
 def lateness(solution: xr.Dataset) -> Picture:
-    """Histogram of lateness, with bins that widen with it."""
+    """Histogram of lateness, with bins that widen as it grows."""
     roles = ("lateness_steps", "lateness_edge")
     counts, edges = (np.asarray(find(solution, role)[""], float) for role in roles)
     figure, grid = style.new_figure(1, 1, 2.6)

@@ -50,7 +50,7 @@ def resolve(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _hidden(target: Path, kind: str) -> Path:
+def _hidden_name(target: Path, kind: str) -> Path:
     return target.parent / f".robins-{kind}-{_key(target)}-{secrets.token_hex(4)}"
 
 
@@ -61,7 +61,7 @@ def _key(target: Path) -> str:
 
 def _leftovers(target: Path, kind: str) -> list[Path]:
     """Hidden folders of this target, latest first."""
-    key = _LEFTOVER.fullmatch(_hidden(target, kind).name)
+    key = _LEFTOVER.fullmatch(_hidden_name(target, kind).name)
     found: list[tuple[int, Path]] = []
     with suppress(OSError), os.scandir(target.parent) as entries:
         for entry in entries:
@@ -181,7 +181,7 @@ def stage(path: str | os.PathLike[str]) -> StagedFolder:
         locks.enter_context(_claim(target))
         sweep(target)
         while True:
-            folder = _hidden(target, "new")
+            folder = _hidden_name(target, "new")
             os.mkdir(folder)
             try:
                 if lock := _lock(folder):
@@ -234,7 +234,7 @@ def commit(staged: StagedFolder) -> None:
 
 
 def _swap(staged: StagedFolder) -> None:
-    target, aside = staged.target, _hidden(staged.target, "old")
+    target, aside = staged.target, _hidden_name(staged.target, "old")
     with ExitStack() as held:
         try:
             if os.path.lexists(target):

@@ -109,7 +109,7 @@ def _slewing(base: Reference, amplitude, period, time, phase, fade_in_s: float) 
     acceleration = s2 * sin + 2.0 * s1 * turns * cos - s * turns**2 * sin
     for k in range(3):
         axis = amplitude[k] * jnp.eye(3)[k][None]
-        base = _turned(base, *(x[:, k : k + 1] * axis for x in (angle, rate, acceleration)))
+        base = _rotated(base, *(x[:, k : k + 1] * axis for x in (angle, rate, acceleration)))
     return base
 
 
@@ -148,8 +148,8 @@ def handover_reference(
     on = length_s * x * (1.0 - x**2 * (6.0 - x * (8.0 - 3.0 * x)))
     on1 = 1.0 - x**2 * (18.0 - x * (32.0 - 15.0 * x))
     on2 = -x * (36.0 - x * (96.0 - 60.0 * x)) / length_s
-    base = _turned(base, *(share * turn_rad[None] for share in (1.0 - s, -s1, -s2)))
-    return _turned(base, *(share * rate_rad_s[None] for share in (on, on1, on2)))
+    base = _rotated(base, *(share * turn_rad[None] for share in (1.0 - s, -s1, -s2)))
+    return _rotated(base, *(share * rate_rad_s[None] for share in (on, on1, on2)))
 
 
 def _fade_in(t: Array, length_s: float) -> tuple[Number, Number, Number]:
@@ -169,7 +169,7 @@ def _from_rest_to_rest(t: Array, length_s: Number) -> tuple[Array, Array, Array]
     )
 
 
-def _turned(base: Reference, angle: Array, rate: Array, acceleration: Array) -> Reference:
+def _rotated(base: Reference, angle: Array, rate: Array, acceleration: Array) -> Reference:
     """Reference followed by a turn about a fixed axis; all three (E, 3) along it."""
     turn = from_rotvec(angle)
     back = conjugate(turn)

@@ -185,7 +185,7 @@ def _standard(white: Array, direction: Array, gross: Array) -> Array:
     return white + gross * (direction / jnp.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def _lost(model: GnssErrorModel, time_s: Array, chance: Array) -> Array:
+def _is_lost(model: GnssErrorModel, time_s: Array, chance: Array) -> Array:
     """Mask (m,) of the fixes dropped by chance or within an outage."""
     lost = chance < model.drop_share
     if model.outages_s is None:
@@ -250,7 +250,7 @@ def observe(
 
     numbers = jnp.arange(len(time))
     normal, chance = jax.vmap(lambda number: _drawn(key, number))(numbers)
-    missing = _lost(model, time, chance[:, _DROPPED])
+    missing = _is_lost(model, time, chance[:, _DROPPED])
     outlier = chance[:, _OUTLIER] < model.outlier_share
     gross = jnp.where(outlier, model.outlier_size, 0.0)[:, None]
     rows = partial(_rows, len(time))

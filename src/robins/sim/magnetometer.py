@@ -75,7 +75,7 @@ def observe_field(
     q = _given.rows("q_nb", q_nb, count, 4)
     field = _vectors("field_n", field_n, count)
     if turn is not None:
-        field = _turned(field, _given.rows("turn", turn, count, 3))
+        field = _rotated(field, _given.rows("turn", turn, count, 3))
     if added_n_t is not None:
         field = field + _vectors("added_n_t", added_n_t, count)
     z = rotate(conjugate(q), field)
@@ -200,7 +200,7 @@ def bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
     return (phase >= 0.0) & (phase < length_s), number.astype(jnp.uint32)
 
 
-def _turned(field: Array, turn: Array) -> Array:
+def _rotated(field: Array, turn: Array) -> Array:
     size_sq = jnp.sum(field * field, -1, keepdims=True)
     along = jnp.sum(turn * field, -1, keepdims=True) / jnp.where(size_sq > 0.0, size_sq, 1.0)
     across = turn - along * field

@@ -240,13 +240,13 @@ def dynamics(
         """Rates of (g, H - H0) in axes 0, a share of the step after its beginning."""
         g, added = y[:3], y[3:]
         momentum, r_b, field_b = u.settled(
-            *(_turned(g, v, -1.0) for v in (u.plus(total, added), place, field))
+            *(_rotated(g, v, -1.0) for v in (u.plus(total, added), place, field))
         )
         wheels = u.plus(held, u.times(share, gained))
         torque = u.plus(gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
         omega, torque = u.settled(u.apply(J_inv, u.minus(momentum, wheels)), torque)
         along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
-        (rate,) = u.settled((*u.times(0.5, along), *_turned(g, torque, 1.0)))
+        (rate,) = u.settled((*u.times(0.5, along), *_rotated(g, torque, 1.0)))
         return rate
 
     k1 = slope((0.0,) * 6, 0.0)
@@ -283,7 +283,7 @@ def wheel_momenta_after(
     return jnp.clip(wheel_h - dt_s * wheel_torques(craft, wheel_torque), -room, room)
 
 
-def _turned(g: u.Three, v: u.Three, sign: float) -> u.Three:
+def _rotated(g: u.Three, v: u.Three, sign: float) -> u.Three:
     """``R(q) v``, or its inverse for a sign of -1, of the quaternion (1, g)/sqrt(1 + g^2)."""
     across = u.times(sign, u.cross(g, v))
     twice = 2.0 / (1.0 + u.dot(g, g))

@@ -246,7 +246,7 @@ def dryden(
     tau = _given.vector("length_m", length_m, 2, low=0.0, above=True) / airspeed_m_s
     along = gauss_markov(jax.random.fold_in(key, _ALONG), count, 1, step_s, tau[0])[:, 0]
     across = _across(jax.random.fold_in(key, _ACROSS), count, step_s / tau[1])
-    return _turned(sigma[None] * jnp.stack([along, across], 1), direction_rad)
+    return _rotated(sigma[None] * jnp.stack([along, across], 1), direction_rad)
 
 
 def von_karman(
@@ -289,7 +289,7 @@ def von_karman(
         return jnp.fft.irfft(jnp.fft.rfft(white) * jnp.asarray(root, complex), size)[:count]
 
     pair = jnp.stack([drawn(_ALONG, steps[0], False), drawn(_ACROSS, steps[1], True)], 1)
-    return _turned(sigma[None] * pair, direction_rad)
+    return _rotated(sigma[None] * pair, direction_rad)
 
 
 def _check(count, step_s, airspeed_m_s, direction_rad):
@@ -299,7 +299,7 @@ def _check(count, step_s, airspeed_m_s, direction_rad):
     _given.number("direction_rad", direction_rad)
 
 
-def _turned(pair, direction_rad):
+def _rotated(pair, direction_rad):
     """Rotate components along and to the right of a direction into north and east."""
     cos, sin = jnp.cos(direction_rad), jnp.sin(direction_rad)
     along, right = pair[:, 0], pair[:, 1]

@@ -79,7 +79,7 @@ def study_from_model(
         return made, belief
 
     def simulate(given: ParametersT, course: Believed, seed: int, run: Array) -> Case:
-        truth, y = drawn(*course, steps, partial(stream, seed, run))
+        truth, y = draw_run(*course, steps, partial(stream, seed, run))
         if faults is not None:
             y = faults(stream(seed, run, Component.FAULT), y)
         return Case(course[1], u=None, y=y, aux={}, truth=truth)
@@ -137,7 +137,7 @@ def require_units(of: str, named: Mapping[str, str]) -> None:
             raise units.UnitError(error.what, f"{of}[{name!r}]", fix) from None
 
 
-def drawn(
+def draw_run(
     model: Model, start: Belief, count: int, key: Callable[[int], Array]
 ) -> tuple[State, dict[str, State]]:
     """True states and readings by sensor of a run, leading axis E.

@@ -35,7 +35,7 @@ from robins.results import Outcome, Progress, ignore_progress, variable
 from robins.systems.judgement import Metric
 from robins.systems.parts import ImuBlock, LogPartition
 from robins.systems.study import Case, Contender, SensorAxes, StateBlock
-from robins.systems.suspects import probabilities, sentences, tables
+from robins.systems.suspects import probabilities, probability_array, sentences
 from robins.systems.tables import (
     EULER,
     SensorUpdates,
@@ -357,7 +357,7 @@ def _tables(
         euler = np.stack([np.asarray(of["euler"]) for of in found])
     data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
     seen = [answer.updates for answer in answers.values()]
-    data |= tables("wrong", [answer.wrong for answer in answers.values()])
+    data |= probability_array("wrong", [answer.wrong for answer in answers.values()])
     return data | innovation_tables(seen, reported.sensors, epoch_s)
 
 

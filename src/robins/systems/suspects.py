@@ -53,7 +53,9 @@ def edges(which: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in change.reshape(-1, 2)]
 
 
-def tables(role: str, found: Sequence[Wrong], runs: int | None = None) -> dict[str, xr.Variable]:
+def probability_array(
+    role: str, found: Sequence[Wrong], runs: int | None = None
+) -> dict[str, xr.Variable]:
     """Array of probabilities (filter, time, suspect); empty if no filter has a suspect.
 
     Args:

@@ -204,7 +204,7 @@ class Px4Simulator(Closing):
         try:
             line.sendall(data)
         except OSError as error:  # after a truncated message nothing more can be sent
-            raise self._gone(error) from None
+            raise self._disconnected(error) from None
 
     def _take(self, timeout_s: float) -> None:
         """Receive for a time, and handle each message."""
@@ -215,9 +215,9 @@ class Px4Simulator(Closing):
         except (TimeoutError, BlockingIOError):
             return
         except OSError as error:
-            raise self._gone(error) from None
+            raise self._disconnected(error) from None
         if not data:
-            raise self._gone("the connection ended")
+            raise self._disconnected("the connection ended")
         found = []
         try:
             with decoding(lambda why: BridgeError(f"bytes of PX4 cannot be parsed: {why}")):
@@ -245,6 +245,6 @@ class Px4Simulator(Closing):
             raise BridgeClosed("PX4 is not connected", self._where, "call accept()")
         return self._line
 
-    def _gone(self, why: OSError | str) -> BridgeClosed:
+    def _disconnected(self, why: OSError | str) -> BridgeClosed:
         self.hang_up()
         return BridgeClosed(f"PX4 has gone: {why}", self._where, "accept() waits for it again")

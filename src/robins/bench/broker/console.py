@@ -84,7 +84,7 @@ class OperatorMessage(Parameters):
     message: str
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> OperatorMessage:
+    def _check_consistency(self) -> OperatorMessage:
         _ = self.payload
         return self
 

@@ -138,7 +138,7 @@ class LinkFault(Parameters):
         return given
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> LinkFault:
+    def _check_consistency(self) -> LinkFault:
         if self.end is not None and self.end <= self.begin:
             raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
         said = self.table.device_faults.get(self.kind)

@@ -221,7 +221,7 @@ class Link:
             else:
                 raw = encode_frame(*frame)
                 self._watch(self.name, "from", raw, frame.header.time_ns)
-                if name is not None and self._refuses(name, frame, now_ns):
+                if name is not None and self._is_invalid(name, frame, now_ns):
                     continue
                 pieces = self._injector.pass_on(self.name, "from", frame, raw, now_ns)
                 self._arrive(pieces, found, now_ns)
@@ -246,13 +246,13 @@ class Link:
             self.count("strange")
             if frame.header.run == self._run:
                 self._check_sequence(frame, now_ns)  # it has come, and is not lost
-        elif not self._refuses(name, frame, now_ns):
+        elif not self._is_invalid(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
             if name == "done":
                 self._check_sequence(frame, now_ns)
             found.append((name, frame))
 
-    def _refuses(self, name: str, frame: Frame, now_ns: int) -> bool:
+    def _is_invalid(self, name: str, frame: Frame, now_ns: int) -> bool:
         """Refuse a frame that contradicts the table of its message."""
         if (why := self._wire.unsound(name, frame.payload)) is None:
             return False

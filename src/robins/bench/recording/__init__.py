@@ -1,4 +1,4 @@
-"""Records of the lines: written, read, replayed to a part, compared.
+"""Recordings of the lines: write, read, replay to a part, compare.
 
 - `layout`: entries in an MCAP file. `writer`, `reader`: to the disk and back.
 - `topics`: messages for other tools, next to the frames; a row per topic.

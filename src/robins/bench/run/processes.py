@@ -134,7 +134,7 @@ class PartProcesses:
         dead = [(part, code) for part, p in asked.items() if (code := p.poll()) is not None]
         for part, _ in dead:
             del self._running[part]
-        return [ProcessExit(part, code, self._said(part)) for part, code in dead]
+        return [ProcessExit(part, code, self._error_output(part)) for part, code in dead]
 
     def kill(self, part: str) -> None:
         """Kill a part at once, as a fault."""
@@ -154,7 +154,7 @@ class PartProcesses:
             p.wait()
         self._running.clear()
 
-    def _said(self, part: str) -> str:
+    def _error_output(self, part: str) -> str:
         assert self._folder is not None
         lines = (self._folder / f"{part}.txt").read_text("utf-8", "replace").strip().splitlines()
         errors = [line for line in lines if _ERROR.match(line)]  # notes may follow them

@@ -86,7 +86,7 @@ class Setup(Parameters):
     says: tuple[OperatorMessage, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> Setup:
+    def _check_consistency(self) -> Setup:
         parts, filters = self.rig.parts, self.rig.filters()
         if unknown := sorted(set(self.ports) - set(parts)):
             raise ValueError(f"ports: there is no part '{unknown[0]}', only {', '.join(parts)}")

@@ -118,8 +118,8 @@ def error_rate(
         dlat' = v_N / (RM + alt), likewise
         dalt' = dv_U
 
-    Rates, v and f are the SINS's, d of a function is its value there minus that at the state less
-    the errors. The gyro's output enters by its error only.
+    Rates, v and f are those of the SINS. For a function of the state, d is its value at the SINS
+    state minus its value at the corrected state. The gyro's output enters through its error only.
 
     Args:
         x: error state, computed minus true.

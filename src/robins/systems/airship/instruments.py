@@ -290,17 +290,17 @@ def printed_constraint(
 
 def _printed_sar(datum: Datum, x: Any, aux: Any):
     """Reading and Jacobian of (45), with the heading row as printed."""
-    heading = _turned(x)[2]
+    heading = _rotated(x)[2]
     H = jnp.zeros((4, 9)).at[[0, 1, 3], [6, 7, 8]].set(jnp.array([1.0, 1.0, -1.0]))
     return read_sar(datum, x, aux), H.at[2, :3].set(heading)
 
 
 def _printed_euler(x: Any, aux: Any):
     """Reading and Jacobian of (48)."""
-    return read_euler(x, aux), jnp.concatenate([_turned(x), jnp.zeros((3, 6))], 1)
+    return read_euler(x, aux), jnp.concatenate([_rotated(x), jnp.zeros((3, 6))], 1)
 
 
-def _turned(x: Nav) -> Array:
+def _rotated(x: Nav) -> Array:
     """(3, 3) derivative of pitch, roll, heading by phi (true minus estimated, NED) as in (44)."""
     return -swap(printed_attitude_rows(*to_euler(x.q_nb.wxyz)))
 

@@ -147,7 +147,7 @@ def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[
     return mean, xp.sqrt(d.multipath**2 + 2.0 * blocked * reach**2 - mean**2)
 
 
-def _turned(angle: Array, c: Array) -> Array:
+def _rotated(angle: Array, c: Array) -> Array:
     s, k = jnp.sin(angle), jnp.cos(angle)
     return jnp.stack([k * c[0] - s * c[1], s * c[0] + k * c[1]])
 
@@ -159,13 +159,13 @@ def _kept(scales: Array, u: MotionStep) -> Array:
 
 def _step(scales: Array, x: GnssState, u: MotionStep) -> GnssState:
     turn = (u.yaw_rate - x.yaw_bias) * u.dt
-    way = u.speed * u.dt * _turned(0.5 * turn, x.direction)
+    way = u.speed * u.dt * _rotated(0.5 * turn, x.direction)
     delay = x.delay
     if delay.shape[0]:
         delay = u.delay_mean + _kept(scales, u) * (delay - u.delay_mean)
     return x._replace(
         position=x.position + jnp.concatenate([way, jnp.zeros(1)]),
-        direction=_turned(turn, x.direction),
+        direction=_rotated(turn, x.direction),
         clock=x.clock + jnp.stack([x.clock[1] * u.dt, jnp.zeros(())]),
         delay=delay,
     )

@@ -125,7 +125,7 @@ class City(Scenario, GnssAssumptions):
     filters: Names = ("ls", "ekf", "huber", "student-t", "switchable", "delays")
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> City:
+    def _check_consistency(self) -> City:
         lasts = sum(leg.lasts_s for leg in self.legs)
         refuse_too_long("rate", lasts, self.rate)
         if self.settle >= lasts:

@@ -209,7 +209,7 @@ class Drive(Scenario):
     filters: Names = ("ekf",)
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> Drive:
+    def _check_consistency(self) -> Drive:
         lasts = sum(leg.lasts_s for leg in self.legs)
         refuse_too_long("imu_rate", lasts, self.imu_rate)
         refuse_too_long("gnss.rate", lasts, self.gnss.rate)

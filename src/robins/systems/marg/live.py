@@ -246,9 +246,9 @@ class LiveMarg(Live):
         since = float(made.dt[-1]), np.asarray(made.theta[-1])
         self._since.append(since)
         if not self._starting:
-            self._q = self._turned(self._q, *since)
+            self._q = self._rotated(self._q, *since)
 
-    def _turned(self, q: Sequence[float], dt: float, theta: np.ndarray) -> tuple[float, ...]:
+    def _rotated(self, q: Sequence[float], dt: float, theta: np.ndarray) -> tuple[float, ...]:
         true = theta + self._gain @ theta - self._bias * dt
         angle = math.sqrt(float(true @ true))
         share = math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
@@ -315,7 +315,7 @@ class LiveMarg(Live):
         self._q = tuple(found.q_nb.tolist())
         self._since = self._since[self._path.n :]
         for since in self._since:
-            self._q = self._turned(self._q, *since)
+            self._q = self._rotated(self._q, *since)
         self._marks = int(self._doubts(found) | (Flag.REST if still else Flag(0)))
 
     def _doubts(self, found: _Step) -> Flag:

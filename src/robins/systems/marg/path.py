@@ -156,7 +156,7 @@ class SamplePath:
         """Increments (M - 1,) between samples (M,), in body axes."""
         table = ImuTable(time_ns, rate, accel, self._kind)
         if self._parameters.update.samples == "means":
-            table = as_means(table, self._usual_s)
+            table = as_increments(table, self._usual_s)
         return from_imu(table, self._usual_s)[0]
 
     # ------------------------------------------------------------------------ samples to blocks
@@ -371,7 +371,7 @@ def _in_blocks(values: np.ndarray, n: int, blank: float) -> np.ndarray:
     return np.concatenate([values, pad]).reshape(blocks, n, *values.shape[1:])
 
 
-def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
+def as_increments(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
     """Rates as increments over the sampling intervals that they end.
 
     A MEMS chip outputs the mean over its last sampling interval, or older still due to its filters;

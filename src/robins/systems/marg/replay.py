@@ -152,7 +152,7 @@ def replay(
         return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
     lasted = np.asarray(log.world.u.samples.dt_s)
-    looks, disturbed = _looks(log, answers)
+    looks, disturbed = _field_sentences(log, answers)
     warned = disturbed + monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
         warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
@@ -421,12 +421,12 @@ def _turned_from_to(log: PreparedMargLog, answer: FilterEstimates) -> str:
     return f"{answer.name}: {', '.join(said)}."
 
 
-def _looks(
+def _field_sentences(
     log: PreparedMargLog, answers: Mapping[str, FilterEstimates]
 ) -> tuple[list[str], list[str]]:
-    """Sentences on refused looks at the field: notes, and warnings where they are a third or more.
+    """Sentences on refused magnetometer readings: notes, or warnings from a share of a third.
 
-    Where there are `FEWEST` looks or more, `replaying.outcome` warns of the share.
+    Where there are `FEWEST` readings or more, `replaying.outcome` warns of the share.
     """
     notes, warned = [], []
     for name, answer in answers.items():

@@ -74,7 +74,7 @@ def initial_alignment(
     )
     if not still:
         window = max(int(np.searchsorted(time, start.moving, side="right")), 1)
-    turned = _turned(theta[:window])
+    turned = _relative_attitudes(theta[:window])
     force = np.sum(turned[:-1].apply(dv[:window]), axis=0) / time[window - 1]
     there = np.all(np.isfinite(field_b[:window]), axis=1)
     tilt = start.tilt if still else start.tilt_moving
@@ -127,7 +127,7 @@ def turn_across(
     """
     first, last = (initial_alignment(*side, parameters) for side in (before, after))
     start, end = (SciRotation.from_quat(np.roll(one.q_nb, -1)) for one in (first, last))
-    start = start * _turned(before[0].theta)[-1]
+    start = start * _relative_attitudes(before[0].theta)[-1]
     each = [max(one.tilt_rad, one.heading_rad) for one in (first, last)]
     spread = math.hypot(*each)
     if not (np.any(first.field_t) and np.any(last.field_t)):
@@ -138,7 +138,7 @@ def turn_across(
     return (start.inv() * end).as_rotvec(), up_b, spread
 
 
-def _turned(theta: np.ndarray) -> SciRotation:
+def _relative_attitudes(theta: np.ndarray) -> SciRotation:
     """Attitude before each interval and after the last, relative to the first."""
     out = [SciRotation.identity()]
     for step in SciRotation.from_rotvec(theta):

@@ -103,10 +103,10 @@ def propagate(g: GyroNoise, x: FieldState, u: GyroTurn) -> FieldState:
 
 def _turn(g: GyroNoise, x: FieldState, u: GyroTurn) -> Array:
     """Rotation vector w (3,) [rad] of a step: the reported angle corrected for bias and scale."""
-    return (u.theta_b - g.step_s * x.bias) / _stretch(x)
+    return (u.theta_b - g.step_s * x.bias) / _scale_factor(x)
 
 
-def _stretch(x: FieldState) -> Array:
+def _scale_factor(x: FieldState) -> Array:
     """(3,) 1 + s, which is far from zero for any usable gyro."""
     return jnp.ones(3) if x.scale is None else 1.0 + x.scale
 
@@ -114,7 +114,7 @@ def _stretch(x: FieldState) -> Array:
 # (B2)
 def propagated(g: GyroNoise, x: FieldState, u: GyroTurn):
     """`propagate` with its Jacobian and noise."""
-    w, gain = _turn(g, x, u), 1.0 / _stretch(x)
+    w, gain = _turn(g, x, u), 1.0 / _scale_factor(x)
     # the rotation of a step is small, but not negligible for a coning body
     C = to_dcm(x.q_nb.wxyz) @ left_jacobian(w)
     rows = [jnp.eye(3), -g.step_s * C * gain[None, :], -C * (gain * w)[None, :]]

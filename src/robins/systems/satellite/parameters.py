@@ -58,7 +58,7 @@ class ReactionWheels(Parameters):
     loss_known: bool = True  # from the start; torques are then allocated to the others
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> ReactionWheels:
+    def _check_consistency(self) -> ReactionWheels:
         for i, axis in enumerate(self.axes):
             if sum(x * x for x in axis) == 0.0:
                 raise ValueError(f"axes: wheel {i} has none: give a vector other than zero")
@@ -179,7 +179,7 @@ class AttitudeLoop(Scenario, Parameters):
     believed: SatelliteAssumptions = pydantic.Field(default_factory=SatelliteAssumptions)
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> AttitudeLoop:
+    def _check_consistency(self) -> AttitudeLoop:
         refuse_unsettled("counted_from", self.counted_from, self.duration)
         refuse_too_long("step", self.duration, 1.0 / self.step)
         ratio = self.star.period / self.step

@@ -80,7 +80,7 @@ def lay_out(given: AttitudeLoop) -> SatelliteCourse:
     base = nadir(circular_orbit(*where, edges))
     if given.points == "inertial":
         base = inertial(base.q_ib[0], edges)
-    wanted = _turned(given, base, edges)
+    wanted = _rotated(given, base, edges)
     frame = round(given.star.period / dt)
     due = np.arange(1, count + 1) % frame == 0
     time = edges[1:]
@@ -116,7 +116,7 @@ def lay_out(given: AttitudeLoop) -> SatelliteCourse:
     )
 
 
-def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Reference:
+def _rotated(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Reference:
     if (slew := given.slew) is None:
         return base
     return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)

@@ -75,7 +75,7 @@ def _shift_fix(values: Values, fault: LinkFault, _: int) -> Values:
     return {**values, "lat": values["lat"] + fault.shift / 6.378137e6}
 
 
-def _blind(values: Values, *_: Any) -> Values:
+def _outage(values: Values, *_: Any) -> Values:
     """GNSS outage: time stamp only, all values NaN, quality 0."""
     nothing = np.full(3, np.nan)
     return {**values, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
@@ -84,7 +84,7 @@ def _blind(values: Values, *_: Any) -> Values:
 _DEVICE_FAULTS = {
     "shifted": DeviceFault("gnss", "fix", "sensed", _shift_fix, ("shift",)),
     "stuck": DeviceFault("gnss", "fix", "repeated"),
-    "blind": DeviceFault("gnss", "fix", "blind", _blind),
+    "blind": DeviceFault("gnss", "fix", "blind", _outage),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
 

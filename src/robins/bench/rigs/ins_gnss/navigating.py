@@ -52,7 +52,7 @@ from robins.systems.ins_gnss.recording import (
 from robins.systems.ins_gnss.reported import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.world import drive_dataset
 from robins.systems.parts import motion_of
-from robins.systems.suspects import sentences, tables, words
+from robins.systems.suspects import probability_array, sentences, words
 from robins.systems.tables import attitude_array, block_array, track_arrays
 
 _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log")
@@ -297,7 +297,7 @@ def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     counts = {f"steps_{of}": int(np.sum(flags >> k & 1)) for k, of in enumerate(FLAGS[:2])}
     each = zip(SUSPECTS, series["state.wrong"].T, strict=True)
     wrong = {name: x for name, x in each if np.any(np.isfinite(x))}
-    arrays |= tables("wrong", [wrong])
+    arrays |= probability_array("wrong", [wrong])
     said = sentences("navigation", series.time_s, wrong)
     return RunFigures(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
 

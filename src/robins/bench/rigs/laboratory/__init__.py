@@ -62,7 +62,7 @@ TAKES = {part: taken for part, taken in messages.TAKES.items() if part != "plant
 }
 
 
-def _hidden(said: Values, fault: LinkFault, _: int) -> Values:
+def _hide_brightest(said: Values, fault: LinkFault, _: int) -> Values:
     """Star field without its brightest stars."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
     said["magnitude"][: fault.stars] = np.nan
@@ -71,7 +71,7 @@ def _hidden(said: Values, fault: LinkFault, _: int) -> Values:
 
 _DEVICE_FAULTS: dict[str, DeviceFault] = {
     "dark": DeviceFault("sky", "stars", "blind", nothing),
-    "hidden": DeviceFault("sky", "stars", "said", _hidden, ("stars",)),
+    "hidden": DeviceFault("sky", "stars", "said", _hide_brightest, ("stars",)),
 }
 """Star simulator that shows nothing, or all but the brightest ``stars``."""
 _STARS = Annotated[int, pydantic.Field(ge=1, le=STARS)]

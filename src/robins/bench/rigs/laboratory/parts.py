@@ -77,14 +77,14 @@ def _dynamics(
     return spacecraft.dynamics(given.craft, craft, *torque, *where, row.disturbance_b, given.step_s)
 
 
-def _turns(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
+def _turn_step(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
     turn = compiled_alone(_dynamics, given, craft, acts, row.course)
     q = spacecraft.kinematics(craft.q_ib, turn.gibbs_b)
     after = CraftState(q, turn.momentum_i, turn.wheel_h)
     return jnp.stack(turn.gibbs_b), rate_b(given.craft, after), after
 
 
-_follows = jax.jit(partial(compiled_alone, spacecraft.kinematics))
+_kinematics = jax.jit(partial(compiled_alone, spacecraft.kinematics))
 
 
 def dynamics(config: SatelliteConfig) -> Part:
@@ -94,7 +94,7 @@ def dynamics(config: SatelliteConfig) -> Part:
     at the end of the last turn.
     """
     wheels = len(config.vehicle.craft.wheel_h)
-    turns = driven(config, _turns)
+    turns = driven(config, _turn_step)
 
     def begin() -> tuple[CraftState, LatchedInput]:
         return config.vehicle.craft, LatchedInput(zero_command())
@@ -127,7 +127,7 @@ def kinematics(config: SatelliteConfig) -> Part:
 
     def act(state: tuple[np.ndarray, Values], k: int, inputs: Inputs):
         turn = inputs["turn"] or state[1]
-        q = np.asarray(_follows(state[0], turn["gibbs_b"]))
+        q = np.asarray(_kinematics(state[0], turn["gibbs_b"]))
         return (q, turn), [("motion", {"q_ib": q, "omega_b": turn["omega_b"]})]
 
     return Part("kinematics", {"turn": 0}, lambda: begin, act, {"turn": first})
@@ -155,7 +155,7 @@ def _sensor(
 ) -> StarFrame:
     """Star sensor frame from the simulated stars; see `nodes.star`."""
     assert given.lens is not None
-    solves = partial(_solves, given.lens, given.star_key)
+    solves = partial(_solve_image, given.lens, given.star_key)
     seen, number = row.course.star.seen, row.course.number
     found = jax.lax.cond(
         seen,
@@ -170,7 +170,7 @@ def _sensor(
     return nodes.star_frame(row, before, *found)
 
 
-def _solves(
+def _solve_image(
     lens: CameraOptics, star_key: Array, vectors_s, magnitude, predicted_q_ib, error, number
 ):
     # Only the presence of a star counts here: the sensor identifies it.
@@ -244,7 +244,7 @@ def star(config: SatelliteConfig) -> Part:
 # -------------------------------------------------------------------------------- one program
 
 
-def _move(
+def _move_craft(
     given: LoopConstants, craft: CraftState, acts: Actuation, row: NoiseFreeInputs
 ) -> CraftState:
     turn = compiled_alone(_dynamics, given, craft, acts, row)
@@ -252,7 +252,7 @@ def _move(
     return CraftState(q, turn.momentum_i, turn.wheel_h)
 
 
-def _look(
+def _observe_stars(
     given: LoopConstants, q_ib: Array, predicted_q_ib: Array, before: Array, row: StepInputs
 ) -> StarFrame:
     return compiled_alone(
@@ -260,7 +260,7 @@ def _look(
     )
 
 
-_REACT = partial(nodes.react, move=_move, look=_look)
+_REACT = partial(nodes.react, move=_move_craft, look=_observe_stars)
 
 
 def inside(

@@ -63,12 +63,12 @@ WIRE = Wire(
 # fmt: on
 
 
-def _magnet(values: Values, fault: LinkFault, _: int) -> Values:
+def _disturb_compass(values: Values, fault: LinkFault, _: int) -> Values:
     """Compass disturbed by a magnet on its right."""
     return {**values, "field_b": values["field_b"] + np.array([0.0, fault.field, 0.0])}
 
 
-def _motor(values: Values, fault: LinkFault, _: int) -> Values:
+def _weaken_motor(values: Values, fault: LinkFault, _: int) -> Values:
     """Motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
     share[fault.motor] = fault.left
@@ -76,9 +76,11 @@ def _motor(values: Values, fault: LinkFault, _: int) -> Values:
 
 
 _DEVICE_FAULTS = {
-    "magnet": DeviceFault("imu", "sample", "sensed", _magnet, ("field",)),
+    "magnet": DeviceFault("imu", "sample", "sensed", _disturb_compass, ("field",)),
     "blind": DeviceFault("gnss", "fix", "blind", nothing),
-    "motor": DeviceFault("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
+    "motor": DeviceFault(
+        "autopilot", "motors", "said", _weaken_motor, ("motor", "left"), needs="motor"
+    ),
 }
 _MOTOR: Any = Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))]
 _FAULTS: dict[str, Any] = {

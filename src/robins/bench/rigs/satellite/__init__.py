@@ -47,7 +47,7 @@ class RateTableParameters(Parameters):
 _SECOND_NS = 1_000_000_000
 
 
-def _turned(said: Values, fault: LinkFault, _: int) -> Values:
+def _rotated_about_z(said: Values, fault: LinkFault, _: int) -> Values:
     """Attitude turned about body z."""
     from robins.rotation import multiply
 
@@ -56,13 +56,13 @@ def _turned(said: Values, fault: LinkFault, _: int) -> Values:
     return {**said, "q_ib": np.asarray(multiply(said["q_ib"], about_z))}
 
 
-def _sign(said: Values, _: LinkFault, now_ns: int) -> Values:
+def _flip_sign(said: Values, _: LinkFault, now_ns: int) -> Values:
     """Quaternion of opposite sign in every other second."""
     odd = (now_ns + 1) // _SECOND_NS % 2 == 1
     return {**said, "q_ib": -said["q_ib"]} if odd else said
 
 
-def _lost(*_: Any) -> Values:
+def _no_attitude(*_: Any) -> Values:
     return {"q_ib": np.full(4, np.nan), "factor": np.zeros(9), "stars": 0}
 
 
@@ -71,11 +71,11 @@ def _without_wheel(said: Values, fault: LinkFault, _: int) -> Values:
     return said
 
 
-SAID: dict[str, DeviceFault] = {
+DEVICE_FAULTS: dict[str, DeviceFault] = {
     "stuck": DeviceFault("star", "star", "repeated"),
-    "turned": DeviceFault("star", "star", "sensed", _turned, ("angle",)),
-    "lost": DeviceFault("star", "star", "blind", _lost),
-    "sign": DeviceFault("star", "star", "said", _sign),
+    "turned": DeviceFault("star", "star", "sensed", _rotated_about_z, ("angle",)),
+    "lost": DeviceFault("star", "star", "blind", _no_attitude),
+    "sign": DeviceFault("star", "star", "said", _flip_sign),
     "wheel": DeviceFault(
         "actuators", "actuation", "said", _without_wheel, ("wheel",), needs="wheel"
     ),
@@ -149,7 +149,7 @@ class SatelliteRig(Rig):
 
     def device_faults(self) -> DeviceFaults:
         """Faults of star sensor and wheels."""
-        return SAID, PARAMETERS
+        return DEVICE_FAULTS, PARAMETERS
 
 
 RIG = SatelliteRig()

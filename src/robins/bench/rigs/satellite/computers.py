@@ -216,7 +216,7 @@ class ControlState(NamedTuple):
     stands_by: bool = False
 
 
-def _steers(
+def _control_step(
     given: LoopConstants, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: StepInputs
 ) -> ActuatorCommand:
     return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
@@ -224,7 +224,7 @@ def _steers(
 
 def acm(config: SatelliteConfig) -> Part:
     """Attitude control: commands torques of the wheels and a dipole of the magnetorquers."""
-    steers = driven(config, _steers)
+    steers = driven(config, _control_step)
     vehicle = config.vehicle
     wheels = len(vehicle.craft.wheel_h)
     mean = config.belief.mean

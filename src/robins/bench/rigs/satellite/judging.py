@@ -41,7 +41,7 @@ from robins.bench.rigs.satellite.messages import (
     USED,
 )
 from robins.bench.rigs.satellite.reference import (
-    Said,
+    CommandedAttitude,
     reference_q_ib,
     target_after,
     target_attitudes,
@@ -200,7 +200,7 @@ def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dic
 
 
 @lru_cache
-def _reacts(react: Callable, form: StateForm) -> Callable:
+def _loop_step(react: Callable, form: StateForm) -> Callable:
     """Loop of one step for a form of the state; cached, so that each is compiled once."""
     return partial(react, form)
 
@@ -233,7 +233,7 @@ def inside(
         return None
     heard = [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]
     loop = Loop(
-        jax.tree_util.Partial(_reacts(react, config.form), config.given),
+        jax.tree_util.Partial(_loop_step(react, config.form), config.given),
         config.vehicle,
         jax.tree_util.tree_map(lambda x: x[:steps], _rows(config, heard)),
         {STAR: config.due[:steps]},
@@ -250,7 +250,7 @@ def inside(
     }
 
 
-def _rows(config: SatelliteConfig, said: list[Said]) -> StepInputs:
+def _rows(config: SatelliteConfig, said: list[CommandedAttitude]) -> StepInputs:
     """Inputs of each step, with the target attitudes that the operator sent."""
     if not said:
         return config.rows
@@ -371,7 +371,7 @@ class Alarms:
         return said
 
 
-def _turned(
+def _slew_command(
     series: MessageSeries, config: SatelliteConfig, step: int, turn_rad: np.ndarray
 ) -> tuple[str, Values]:
     """Command to an inertially fixed attitude, turned from the present target."""
@@ -382,10 +382,10 @@ def _turned(
 _SLEW_DEG = 10.0
 SAYS = {
     **{
-        f"slew {_SLEW_DEG:g} deg about {axis}": partial(_turned, turn_rad=turn_rad)
+        f"slew {_SLEW_DEG:g} deg about {axis}": partial(_slew_command, turn_rad=turn_rad)
         for axis, turn_rad in zip(_XYZ, np.radians(_SLEW_DEG) * np.eye(3), strict=True)
     },
-    "hold this attitude": partial(_turned, turn_rad=np.zeros(3)),
+    "hold this attitude": partial(_slew_command, turn_rad=np.zeros(3)),
     "back to the course": lambda series, config, step: ("reference", {}),
     "control: stand by": lambda series, config, step: ("mode", {"mode": STAND_BY}),
     "control: run": lambda series, config, step: ("mode", {"mode": RUN}),

@@ -29,7 +29,7 @@ _DEFAULT_RATE = 0.5  # of the greatest rate, if no rate is commanded
 _OFF = 2.0 * UNIT  # greatest error of the squared norm of a quaternion
 _BRAKES = 4.0  # peak acceleration times duration over initial rate, for a decaying rate: 3.94
 
-Said = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
+CommandedAttitude = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
 
 
 class SlewPlan(NamedTuple):
@@ -120,7 +120,7 @@ def limits(config: SatelliteConfig) -> tuple[float, float]:
     return SHARE * h / inertia, SHARE * tau / inertia
 
 
-def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Reference]:
+def target_attitudes(config: SatelliteConfig, said: Iterable[CommandedAttitude]) -> list[Reference]:
     """Target attitudes at each edge of the E steps, E + 1 of them.
 
     Args:
@@ -137,7 +137,7 @@ def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Refe
     return out
 
 
-def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[Said]:
+def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[CommandedAttitude]:
     """Commands sent by the end of a number of steps; a finite rate marks a command, since its
     attitude may be NaN.
     """

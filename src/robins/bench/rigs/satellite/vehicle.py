@@ -67,7 +67,7 @@ def acting_command(
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
 
 
-def _moves(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
+def _step_craft(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
     craft = nodes.compiled_alone(nodes.plant, given, craft, acts, row.course)
     return craft, rate_b(given.craft, craft)
 
@@ -75,7 +75,7 @@ def _moves(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepIn
 def plant(config: SatelliteConfig) -> Part:
     """Dynamics and kinematics of the craft; without actuation nothing acts on it."""
     wheels = len(config.vehicle.craft.wheel_h)
-    moves = driven(config, _moves)
+    moves = driven(config, _step_craft)
 
     def begin() -> tuple[CraftState, LatchedInput]:
         return config.vehicle.craft, LatchedInput(zero_command())
@@ -129,7 +129,7 @@ def table(config: SatelliteConfig) -> Part:
     return Part("table", {"motion": 0}, lambda: begin, act, example, rare)
 
 
-def _gives(
+def _actuate(
     given: LoopConstants, wheel_h: Array, command: ActuatorCommand, row: StepInputs
 ) -> Actuation:
     return nodes.actuators(given, wheel_h, command, row.course)
@@ -138,7 +138,7 @@ def _gives(
 def actuators(config: SatelliteConfig) -> Part:
     """Wheels and magnetorquers; a command is held for one more step, then they give zero."""
     wheels = len(config.vehicle.craft.wheel_h)
-    gives = driven(config, _gives)
+    gives = driven(config, _actuate)
 
     def begin() -> tuple[Numbers, LatchedInput]:
         return config.vehicle.craft.wheel_h, LatchedInput(zero_command())

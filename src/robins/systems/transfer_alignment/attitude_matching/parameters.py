@@ -97,7 +97,7 @@ class AttitudeMatching(Scenario):
     h_infinity: HInfinityRequirements = pydantic.Field(default_factory=HInfinityRequirements)
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> AttitudeMatching:
+    def _check_consistency(self) -> AttitudeMatching:
         lasts = self.manoeuvre.duration
         refuse_too_long("step", lasts, 1.0 / self.step)
         refuse_unsettled("settle", self.settle, lasts)

@@ -218,7 +218,7 @@ class PairParameters(Parameters):
     disturbance: PairDisturbance = pydantic.Field(default_factory=PairDisturbance)
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> PairParameters:
+    def _check_consistency(self) -> PairParameters:
         if self.manoeuvre is not None:  # a recorded pair brings its own
             lasts = self.manoeuvre.lasts_s
             refuse_too_long("slave.rate", lasts, self.slave.rate)

@@ -230,7 +230,7 @@ def simulate_pair(pair: PairParameters, course: PairCourse, seed: int, index: Ar
     # From true to nominal slave axes: q_nominal^-1 exp(lambda) q_nominal exp(mu).
     in_slave_axes = rotate(conjugate(jnp.asarray(course.q_nominal)), angle)
     d = multiply(from_rotvec(in_slave_axes), from_rotvec(mounting))
-    theta, dv = _felt(course, d)
+    theta, dv = _ideal_increments(course, d)
     q_nb = multiply(jnp.asarray(course.q_nb), d)
     theta_error, dv_error, *biases = _slave_errors(pair, course, stream(seed, index, Component.IMU))
     begin = [*pair.start.attitude, *pair.start.velocity, *pair.start.position]
@@ -276,7 +276,7 @@ def _flexure(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Arra
     return simulate_flexure(f.flexure, key, 1.0 / pair.slave.rate, len(course.dt), load)
 
 
-def _felt(course: PairCourse, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
+def _ideal_increments(course: PairCourse, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
     """Ideal increments (N, 3) each along the true slave axes."""
     back = conjugate(d[:-1])
     turned = multiply(multiply(back, jnp.asarray(course.turn)), d[1:])
