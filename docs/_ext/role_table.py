@@ -14,7 +14,7 @@ def names(role: Role) -> str:
     """Names of the arrays of a row."""
     found = re.search(r"\{(.*)\}", role.variable)
     choices = found[1].split("|") if found else []
-    every = [role.called(of) for of in choices] if len(choices) > 1 else [role.variable]
+    every = [role.array_name(of) for of in choices] if len(choices) > 1 else [role.variable]
     return ", ".join(f"`{name}`" for name in every)
 
 

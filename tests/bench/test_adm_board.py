@@ -18,7 +18,7 @@ from robins.bench.rigs.satellite.messages import HELD, SAFE, SHORT, SILENT, USED
 from robins.cli import main
 from robins.filters import OnlineFilter
 from robins.program import NativeState
-from robins.systems.satellite.nodes import STAR, believable
+from robins.systems.satellite.nodes import STAR, plausible_attitude
 from robins.workbench.export import SMALL, export_filter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
@@ -136,7 +136,7 @@ def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):
     for k, inputs in enumerate(reached):
         host.predict(inputs["gyro"]["theta_b"])
         if "star" in inputs:
-            host.update(believable(jnp.asarray(inputs["star"]["q_ib"])), STAR)
+            host.update(plausible_attitude(jnp.asarray(inputs["star"]["q_ib"])), STAR)
         mean = host.belief.mean
         np.testing.assert_array_equal(told[k]["q_ib"], mean.attitude.wxyz)
         np.testing.assert_array_equal(told[k]["gyro_bias"], mean.gyro_bias)

@@ -263,9 +263,9 @@ def test_the_bench_never_waits_for_a_server_that_does_not_read(live):
         # What was dropped is the oldest of what waited; what came last is there.
         assert np.array_equal(got[-300:], np.arange(5700, 6000))
         assert np.all(np.diff(got) > 0)
-        beat = texts(page, "beat")
-    assert beat["dropped_before"] == live.dropped
-    assert beat["dropped"] == 0
+        heartbeat = texts(page, "beat")
+    assert heartbeat["dropped_before"] == live.dropped
+    assert heartbeat["dropped"] == 0
 
 
 @contextmanager

@@ -105,12 +105,12 @@ def test_numbers_are_placed_where_the_key_points():
 
 def test_a_course_that_differs_is_seen_and_what_never_compares_is_not():
     course = {"at": np.array([1.0, np.nan]), "count": 3}
-    assert not sobol.course_differs(course, course, {"at": np.array([1.0, np.nan]), "count": 3})
-    assert sobol.course_differs(course, course, course | {"count": 4})
-    assert sobol.course_differs(course, course, {"at": np.array([1.0, 2.0]), "count": 3})
-    assert sobol.course_differs(course, course, course | {"more": 1.0})
+    assert not sobol.courses_differ(course, course, {"at": np.array([1.0, np.nan]), "count": 3})
+    assert sobol.courses_differ(course, course, course | {"count": 4})
+    assert sobol.courses_differ(course, course, {"at": np.array([1.0, 2.0]), "count": 3})
+    assert sobol.courses_differ(course, course, course | {"more": 1.0})
     first, again, other = ([lambda: None, 1.0] for _ in range(3))
-    assert not sobol.course_differs(first, again, other)
+    assert not sobol.courses_differ(first, again, other)
 
 
 # ----------------------------------------------------------------- points against runs

@@ -399,12 +399,12 @@ def test_the_compiler_is_set_up_where_it_takes_the_settings(
 
 def test_the_compiler_knows_its_settings():
     """It ends the process otherwise; what is tried in a process of its own finds that out."""
-    assert cache._tried("of this test", None)
+    assert cache._accepts_settings("of this test", None)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(cache, "_XLA_FLAGS", "--xla_no_such_setting=1")
-        assert cache._tried("of this test", None) is False
+        assert cache._accepts_settings("of this test", None) is False
         patched.setattr(cache, "_TRIAL", "raise SystemExit(3)")  # which tells nothing of XLA
-        assert cache._tried("of this test", None) is None
+        assert cache._accepts_settings("of this test", None) is None
     code = "from robins.cli import cache; cache.enable(); import os, jax.numpy as n; n.ones(1) + 1"
     ours = ("XLA_FLAGS", "TF_CPP_MIN_LOG_LEVEL")
     bare = {k: v for k, v in os.environ.items() if k not in ours}

@@ -44,7 +44,7 @@ def test_an_array_is_found_by_its_role_and_an_old_one_by_its_name(role, of):
 
 
 def test_all_rows_have_names_of_their_own():
-    names = [role.called(of) for role, of in examples()]
+    names = [role.array_name(of) for role, of in examples()]
     assert len(names) == len(set(names))
 
 

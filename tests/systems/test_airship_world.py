@@ -31,7 +31,7 @@ from robins.systems.airship.model import (
     PRODUCT,
     WIND_STATES,
     WithWind,
-    walk,
+    white_noise_factor,
 )
 from robins.systems.airship.world import lay_out, sampled_at, simulate
 from robins.workbench import InputError
@@ -316,7 +316,7 @@ def test_sensors_read_with_the_slope_of_differences(at):
 
 def test_noise_of_a_step_is_that_of_a_random_walk():
     gyro, accel, dt = 3e-6, 0.07, 0.8
-    L = np.asarray(walk(InsNoise(gyro, accel), dt))
+    L = np.asarray(white_noise_factor(InsNoise(gyro, accel), dt))
     A, G = np.zeros((9, 9)), np.zeros((9, 6))
     A[6:, 3:6] = np.eye(3)
     G[:3, :3], G[3:6, 3:] = gyro * np.eye(3), accel * np.eye(3)

@@ -189,12 +189,12 @@ class Latencies:
 
 def _quantiles(histogram: Histogram) -> dict[str, float | int | None]:
     """Quantiles of a histogram in microseconds, None where it is empty."""
-    p50, p99 = (_us(histogram.quantile(share)) for share in (0.5, 0.99))
-    most = _us(histogram.most) if histogram.count else None
+    p50, p99 = (_microseconds(histogram.quantile(share)) for share in (0.5, 0.99))
+    most = _microseconds(histogram.most) if histogram.count else None
     return {"p50": p50, "p99": p99, "max": most, "count": histogram.count}
 
 
-def _us(ns: float | int | None) -> float | None:
+def _microseconds(ns: float | int | None) -> float | None:
     return None if ns is None else ns / 1000
 
 

@@ -149,7 +149,7 @@ def _each(one: Callable[[PyTree], PyTree], many: PyTree) -> PyTree:
 def worlds(
     problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0, batch: PyTree = None
 ) -> Iterator[tuple[PyTree, int]]:
-    """Simulate runs first .. first + runs - 1, a chunk at a time, by `batch_of` the problem.
+    """Simulate runs first .. first + runs - 1, one chunk at a time, with `batch_of` the problem.
 
     Yields:
         What `Problem.simulate` returns, with a leading axis of ``filled(runs, chunk)``, and how

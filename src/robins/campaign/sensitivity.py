@@ -69,10 +69,10 @@ class ParameterRange(NamedTuple):
     def at(self, share: Any) -> dict[Path, Any]:
         """Numbers at a fraction, from 0 to 1, of the range."""
         ends = zip(self.paths, self.low, self.high, strict=True)
-        return {path: one_at(share, a, b, self.by_logarithm) for path, a, b in ends}
+        return {path: interpolated(share, a, b, self.by_logarithm) for path, a, b in ends}
 
 
-def one_at(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
+def interpolated(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
     """Number at a fraction, from 0 to 1, between its ends."""
     return low * (high / low) ** share if by_logarithm else low + (high - low) * share
 
@@ -167,7 +167,7 @@ def _believed(start: Any) -> Array:
     return jnp.sum(jnp.where(size > 0.0, jnp.log(jnp.where(size > 0.0, size, 1.0)), 0.0))
 
 
-def follows(believed: np.ndarray) -> list[bool]:
+def changes_belief(believed: np.ndarray) -> list[bool]:
     """True for each parameter that changes the initial belief of the filter.
 
     Args:
@@ -176,7 +176,7 @@ def follows(believed: np.ndarray) -> list[bool]:
     return [not np.allclose(one, believed[0], rtol=1e-9, atol=1e-12) for one in believed[2:]]
 
 
-def course_differs(before: Any, course: Any, after: Any) -> bool:
+def courses_differ(before: Any, course: Any, after: Any) -> bool:
     """True if two courses differ in anything that can be compared.
 
     Args:
@@ -207,7 +207,7 @@ def _alike(a: Data, b: Data) -> bool:
 
 
 def untraceable(budget: SensitivityRuns) -> list[int]:
-    """Numbers of the parameters whose worlds JAX cannot trace, each varied alone."""
+    """Indices of the parameters whose worlds JAX cannot trace, each varied alone."""
 
     def fails(one: ParameterRange) -> bool:
         alone = budget._replace(ranges=(one,))

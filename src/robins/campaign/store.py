@@ -144,34 +144,36 @@ class ObjectStore:
         """Put an object; see `FolderStore`."""
         mode = "overwrite" if overwrite else "create"
         taken = self._obstore.exceptions.AlreadyExistsError
-        with suppress(taken), self._naming(f"write {name}"):
+        with suppress(taken), self._named_errors(f"write {name}"):
             self._obstore.put(self._store, name, content, mode=mode)
             return True
         return False
 
     def get(self, name: str) -> bytes | None:
         """Read an object; see `FolderStore`."""
-        with suppress(FileNotFoundError), self._naming(f"read {name}"):
+        with suppress(FileNotFoundError), self._named_errors(f"read {name}"):
             return bytes(self._obstore.get(self._store, name).bytes())
         return None
 
     def names(self, group: str) -> set[str]:
         """List a group; see `FolderStore`."""
-        with self._naming(f"list {group}"):
+        with self._named_errors(f"list {group}"):
             found = (one for some in self._obstore.list(self._store, group) for one in some)
             return {one["path"].removeprefix(f"{group}/") for one in found}
 
     def drop(self, name: str) -> None:
         """Remove an object; see `FolderStore`."""
-        with suppress(FileNotFoundError), self._naming(f"remove {name}"):
+        with suppress(FileNotFoundError), self._named_errors(f"remove {name}"):
             self._obstore.delete(self._store, name)
 
     def sweep(self) -> None:
         """Do nothing: object storage never shows half-written objects."""
 
     @contextmanager
-    def _naming(self, what: str) -> Iterator[None]:
-        """State what failed; an object that exists, or is missing, is not a failure."""
+    def _named_errors(self, what: str) -> Iterator[None]:
+        """Turn errors of the storage into a `RobinsError` with the failed action, unless an object
+        exists or is missing.
+        """
         errors = self._obstore.exceptions
         try:
             yield

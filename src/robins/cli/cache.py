@@ -45,7 +45,7 @@ def enable() -> None:
     folder = _folder()
     if "XLA_FLAGS" not in os.environ and _on_processor():
         version = importlib.metadata.version("jaxlib")
-        taken = version.startswith(_KNOWN) or _tried(version, folder)
+        taken = version.startswith(_KNOWN) or _accepts_settings(version, folder)
         os.environ["XLA_FLAGS"] = _XLA_FLAGS if taken else ""
         if taken is False:
             with contextlib.suppress(OSError):
@@ -62,7 +62,7 @@ def _on_processor() -> bool:
     return not accelerated or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 
-def _tried(version: str, folder: Path | None) -> bool | None:
+def _accepts_settings(version: str, folder: Path | None) -> bool | None:
     """True if a version of jaxlib accepts the settings; tried in another process, and stored.
 
     None if the trial itself failed; it is repeated next time.

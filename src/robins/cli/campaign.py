@@ -83,7 +83,7 @@ _PATIENCE_S = 600.0  # wait for a report that another coordinator writes
 _WHERE = click.argument("where", metavar="DIR")
 
 
-def _held(held: bool) -> None:
+def _end_with_parent(held: bool) -> None:
     """End this process when its parent closes its standard input, or has ended."""
     if not held:
         return
@@ -138,7 +138,9 @@ def _deliver(
 
 @campaign.command(short_help="Compute what is missing, as one more worker.")
 @_WHERE
-@option("--held", is_flag=True, hidden=True, expose_value=False, callback=of_value(_held))
+@option(
+    "--held", is_flag=True, hidden=True, expose_value=False, callback=of_value(_end_with_parent)
+)
 @TRUST
 @answers
 def work(where: str, as_json: bool) -> None:

@@ -54,7 +54,7 @@ def print_and_write(
     """
     try:
         if not as_json:
-            _answer(outcome)
+            _print_answer(outcome)
             click.echo("\nWriting the report ...")
     except OSError:  # standard output is closed: the result is written all the same
         write()
@@ -70,7 +70,7 @@ def print_and_write(
         click.echo(line.replace("{out}", str(result.path)))
 
 
-def _answer(outcome: Outcome) -> None:
+def _print_answer(outcome: Outcome) -> None:
     """Print tables, notes and warnings."""
     from rich.console import Console
 

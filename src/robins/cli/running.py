@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return ExitStatus.FAILED
             if "--debug" in given and not isinstance(error, click.ClickException):
                 traceback.print_exception(error)
-            text, status = _described(error)
+            text, status = _describe_error(error)
             _print_error(text)
             return status
 
@@ -122,11 +122,11 @@ def _interrupted(for_good: bool) -> ExitStatus:
         "command starts again."
     )
     if for_good:
-        _leave(ExitStatus.INTERRUPTED)
+        _exit_now(ExitStatus.INTERRUPTED)
     return ExitStatus.INTERRUPTED
 
 
-def _leave(status: ExitStatus) -> NoReturn:
+def _exit_now(status: ExitStatus) -> NoReturn:
     """End the process without the clean-up of the interpreter.
 
     Compilation threads may still run during that clean-up, which then ends in a segmentation fault
@@ -138,7 +138,7 @@ def _leave(status: ExitStatus) -> NoReturn:
     os._exit(status)
 
 
-def _described(error: Exception) -> tuple[str, ExitStatus]:
+def _describe_error(error: Exception) -> tuple[str, ExitStatus]:
     """Error in a few lines, and its exit status."""
     bad_input = False
     if isinstance(error, click.UsageError):

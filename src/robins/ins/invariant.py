@@ -64,8 +64,8 @@ def propagate(
         gravity: (3,) m/s^2, navigation axes.
     """
     g = jnp.asarray(gravity, float)
-    dt, step = _less_biases(x, increment)
-    return x._replace(pose=_coasted(x.pose, dt, g) @ step)
+    dt, step = _bias_corrected(x, increment)
+    return x._replace(pose=_free_fall(x.pose, dt, g) @ step)
 
 
 def transition(
@@ -79,8 +79,8 @@ def transition(
         it times dt is position.
     """
     g = jnp.asarray(gravity, float)
-    dt, step = _less_biases(x, increment)
-    coasted = _coasted(x.pose, dt, g)
+    dt, step = _bias_corrected(x, increment)
+    coasted = _free_fall(x.pose, dt, g)
     moved = coasted @ step
     drift = jnp.eye(9).at[6:9, 3:6].set(dt * jnp.eye(3))
     # An error of the increments is Upsilon_true Upsilon^-1 = exp(slip), in axes before the step.
@@ -176,7 +176,7 @@ def _read_direction(way: Array, x: InvariantState, aux: Data) -> Array:
     return x.pose.rotation.inverse().apply(way)
 
 
-def _less_biases(x: InvariantState, increment: Increments) -> tuple[Array, ExtendedPose]:
+def _bias_corrected(x: InvariantState, increment: Increments) -> tuple[Array, ExtendedPose]:
     """Duration of an interval, and Upsilon corrected for the biases."""
     dt = jnp.asarray(increment.dt, float)
     theta, dv = jnp.asarray(increment.theta, float), jnp.asarray(increment.dv, float)
@@ -186,7 +186,7 @@ def _less_biases(x: InvariantState, increment: Increments) -> tuple[Array, Exten
     return dt, ExtendedPose(turn, dv, dr, x.pose.error)
 
 
-def _coasted(pose: ExtendedPose, dt: Array, g: Array) -> ExtendedPose:
+def _free_fall(pose: ExtendedPose, dt: Array, g: Array) -> ExtendedPose:
     """Gamma Phi(X): free fall."""
     velocity = pose.velocity + g * dt
     position = pose.position + pose.velocity * dt + 0.5 * g * dt**2

@@ -131,10 +131,10 @@ def calibrate(
     centre, size = (low + high) / 2.0, float((high - low).max()) / 2.0
     if not size > 0.0:
         raise CalibrationError("all samples of the field are equal: turn the sensor about")
-    unit = _evened(((z - centre) / size)[:: -(-len(z) // MOST)])
+    unit = _thinned_evenly(((z - centre) / size)[:: -(-len(z) // MOST)])
     _refuse_flat(unit)
     found = _best(unit, centre, size, strength_t, soft_iron)
-    return _upright(found, vertical) if level else found
+    return _embed_in_three(found, vertical) if level else found
 
 
 def _best(
@@ -199,7 +199,7 @@ def _horizontal(strength_t: float, vertical_t: float) -> float:
     return float(np.sqrt(strength_t**2 - vertical_t**2))
 
 
-def _upright(found: Calibration, vertical_t: float) -> Calibration:
+def _embed_in_three(found: Calibration, vertical_t: float) -> Calibration:
     """Embed a calibration of the horizontal axes in three, the vertical one unchanged."""
     offset, matrix, sigma = np.zeros(3), np.eye(3), np.zeros((3, 3))
     offset[:2], matrix[:2, :2], sigma[:2, :2] = found.offset_t, found.matrix, found.matrix_sigma
@@ -229,7 +229,7 @@ def _refuse_stretched(found: Calibration) -> None:
         )
 
 
-def _evened(z: np.ndarray) -> np.ndarray:
+def _thinned_evenly(z: np.ndarray) -> np.ndarray:
     """Samples in order of time, thinned evenly to at most `_SHARE` in each small cube.
 
     A sensor at rest, as before and after the rotations, would otherwise outweigh them by samples

@@ -1,7 +1,8 @@
 """Vectors, matrices and quaternions as tuples of scalars: faster than arrays in a compiled loop.
 
 A scan over small arrays spends its time launching kernels; scalar operations are fused into few.
-Under `vmap` each scalar is an array over the batch. Long chains of them need `settled` in between.
+Under `vmap` each scalar is an array over the batch. Long chains of them need `behind_barrier` in
+between.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def matrix(m: Shaped[Real, "n m"]) -> Matrix:
     return tuple(scalars(m[i]) for i in range(m.shape[0]))
 
 
-def settled(*vectors: Three) -> list[tuple[Scalar, ...]]:
+def behind_barrier(*vectors: Three) -> list[tuple[Scalar, ...]]:
     """Same vectors behind a fusion barrier, so that each is computed once.
 
     Otherwise XLA would recompute a component wherever it is used.

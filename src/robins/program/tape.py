@@ -354,7 +354,7 @@ class Tape:
 
     @classmethod
     def of(cls, arrays: Sequence[np.ndarray], sizes: np.ndarray) -> Tape:
-        """Tape from the arrays and sizes of another one."""
+        """Tape from the arrays and sizes of an existing one."""
         made = object.__new__(cls)
         made._hold(arrays, sizes)
         return made

@@ -123,8 +123,8 @@ class Program:
 
     Attributes:
         graph: its nodes.
-        inputs: arrays in the order of the function's leaves; ``input`` nodes count their entries,
-            reals by themselves and all other kinds by themselves.
+        inputs: arrays in the order of the function's leaves; ``input`` nodes number their entries,
+            reals and all other kinds separately.
         outputs: arrays of nodes of the results.
         results: their shapes and types.
         structure: pytrees of the arguments and of the results.

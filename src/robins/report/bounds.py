@@ -81,14 +81,14 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
     for k, axes in enumerate(stack):
         lines = [(unaided.values[:, k], _NONE)]
         for i, one in enumerate(without.values[: len(names)], 1):
-            lines.append((one[:, k], style.filter_look(i)))
+            lines.append((one[:, k], style.filter_style(i)))
         lines.append((every.values[:, k], {"color": style.colour(0), "linewidth": 1.6}))
         for y, look in lines:
             clock.plot(axes, every.x, np.where(y > 0.0, y, np.nan), **look)
         _scale(axes, every.values[:, k], without.values[..., k], unaided.values[:, k])
     keys = [style.key("all sensors", color=style.colour(0), linewidth=1.6)]
     keys += [
-        style.key(f"without {words(name)}", **style.filter_look(i))
+        style.key(f"without {words(name)}", **style.filter_style(i))
         for i, name in enumerate(names, 1)
     ]
     style.legend(figure, [*keys, style.key("no sensor", **_NONE)])
@@ -140,7 +140,7 @@ def information(solution: xr.Dataset) -> Picture:
 
 
 def epochs(solution: xr.Dataset, times_s: Sequence[float] = ()) -> list[int]:
-    """Numbers of the epochs at the given times; by default at the quarters.
+    """Indices of the epochs at the given times; by default at the quarters of the run.
 
     Raises:
         ValueError: a time is not among those of the solution.

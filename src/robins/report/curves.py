@@ -33,7 +33,7 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
     figure, axes, clock = series.single_axes(solution, data.x, "share of the runs")
     for i in range(len(filters)):
         share = data.values[i, :, 0]
-        clock.plot(axes, data.x, share, **style.filter_look(i))
+        clock.plot(axes, data.x, share, **style.filter_style(i))
         if tinted:
             low, high = interval(np.rint(share * runs), runs)
             x, low, high = series.thin(data.x / clock.seconds, low, high)
@@ -75,7 +75,7 @@ def worst_case(solution: xr.Dataset) -> Picture | None:
         return None
     figure, axes, clock = series.single_axes(solution, time, "local bound / gamma")
     for i in shown:
-        clock.plot(axes, time, ratio[i], **style.filter_look(i))
+        clock.plot(axes, time, ratio[i], **style.filter_style(i))
     axes.axhline(1.0, color=style.TRUTH, linewidth=0.8)
     axes.set(ylim=(-0.02, max(1.1, 1.1 * float(np.nanmax(ratio[shown])))))
     keys = style.filter_keys(filters)
@@ -167,7 +167,7 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            clock.plot(axes, error.x, error.values[i, :, k], **style.filter_look(i))
+            clock.plot(axes, error.x, error.values[i, :, k], **style.filter_style(i))
             lines.append(error.values[i, :, k])
             if sigma is not None:
                 _envelope(axes, sigma, i, k, clock, len(filters))
@@ -204,7 +204,7 @@ def _envelope(
     reach = 3.0 * sigma.values[i, :, k]
     x, low, high = series.thin(sigma.x / clock.seconds, centre - reach, centre + reach)
     for bound in (low, high):
-        axes.plot(x, bound, **style.filter_look(i, linewidth=0.6))
+        axes.plot(x, bound, **style.filter_style(i, linewidth=0.6))
     if count <= 2:  # more would hide each other
         axes.fill_between(x, low, high, color=style.colour(i), alpha=0.10, linewidth=0)
 
@@ -221,8 +221,8 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
     turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(found.unit)
     for k, axes in enumerate(stack):
         for i in range(len(filters)):
-            y = _broken(found.values[i, :, k], turn)
-            clock.plot(axes, found.x, y, **style.filter_look(i))
+            y = _with_gaps(found.values[i, :, k], turn)
+            clock.plot(axes, found.x, y, **style.filter_style(i))
             # The envelope of a wrapping angle would be drawn across the wrap.
             if sigma is not None and turn is None:
                 _envelope(axes, sigma, i, k, clock, len(filters), centre=y)
@@ -245,7 +245,7 @@ def values(solution: xr.Dataset, name: str) -> Picture:
     return estimates(solution, name, "value")
 
 
-def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:
+def _with_gaps(y: np.ndarray, turn: float | None) -> np.ndarray:
     """Values with gaps where an angle wraps, so that no line is drawn across the figure."""
     if turn is None:
         return y
@@ -280,7 +280,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            clock.plot(axes, rms.x, rms.values[i, :, k], **style.filter_look(i))
+            clock.plot(axes, rms.x, rms.values[i, :, k], **style.filter_style(i))
             lines.append(rms.values[i, :, k])
             if stated is not None:
                 x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
@@ -344,6 +344,6 @@ def height(solution: xr.Dataset) -> Picture | None:
         clock.plot(axes, series.x_of(truth, 0), np.asarray(truth, float), **look)
         more.append(style.key("reference", **look))
     for i in range(len(filters)):
-        clock.plot(axes, data.x, data.values[i, :, 0], **style.filter_look(i))
+        clock.plot(axes, data.x, data.values[i, :, 0], **style.filter_style(i))
     series.legend(figure, solution, [*style.filter_keys(filters), *more])
     return Picture("height", "Height profile", "Height above the WGS-84 ellipsoid.", figure)

@@ -73,7 +73,7 @@ def _page(summary: Summary, figures: str, origin: ReportOrigin) -> str:
 def _verdict(summary: Summary) -> str:
     claims = summary["claims"]
     if sentence := summary.get("verdict", ""):
-        worst = numbers.state_of(sentence)
+        worst = numbers.verdict_class(sentence)
         return f'<p class="verdict {worst}">{_SIGNS.get(worst, "")} {escape(sentence)}</p>'
     if not claims and not summary.get("machine"):
         return ""  # of a recorded log nothing is claimed

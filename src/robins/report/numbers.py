@@ -144,7 +144,7 @@ def marked(values: Values, metric: str) -> str:
     return show(values.get(metric)) + (MARK if outside(values, metric) else "")
 
 
-def state_of(verdict: str) -> str:
+def verdict_class(verdict: str) -> str:
     """Claim verdict that sets the colour of the sentence on a replay; "" for none."""
     return next((state for begin, state in _STATES.items() if verdict.startswith(begin)), "")
 

@@ -24,8 +24,8 @@ def percentiles(solution: xr.Dataset, block: str) -> Picture:
     # Zero and infinity have no logarithm: a line ends where a percentile diverged.
     lengths = np.where(np.isfinite(data.values) & (data.values > 0.0), data.values, np.nan)
     for i, of in enumerate(lengths):
-        clock.plot(axes, data.x, of[:, middle], **style.filter_look(i))
-        clock.plot(axes, data.x, of[:, highest], **style.filter_look(i, linewidth=0.7))
+        clock.plot(axes, data.x, of[:, middle], **style.filter_style(i))
+        clock.plot(axes, data.x, of[:, highest], **style.filter_style(i, linewidth=0.7))
         if tinted:
             tint = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
             axes.fill_between(data.x / clock.seconds, of[:, low], of[:, high], **tint)

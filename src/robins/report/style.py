@@ -139,7 +139,7 @@ def line(index: int) -> Any:
     return LINES[index % len(LINES)]
 
 
-def filter_look(index: int, **more: Any) -> dict[str, Any]:
+def filter_style(index: int, **more: Any) -> dict[str, Any]:
     """Colour and line style of the filter or axis of that number, and more properties of a line."""
     return {"color": colour(index), "linestyle": line(index), **more}
 
@@ -151,7 +151,7 @@ def key(label: str, **line_properties: Any) -> Line2D:
 
 def filter_keys(filters: Sequence[str]) -> list[Line2D]:
     """Entries for the filters, in their colours."""
-    return [key(name, **filter_look(i)) for i, name in enumerate(filters)]
+    return [key(name, **filter_style(i)) for i, name in enumerate(filters)]
 
 
 def outage_key() -> Patch:

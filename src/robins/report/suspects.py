@@ -30,10 +30,10 @@ def suspects(solution: xr.Dataset) -> Picture | None:
         if true is not None:
             style.shade(axes, first.x / clock.seconds, np.asarray(true)[:, k] != 0, style.BAND)
         for i in stating:
-            look = style.filter_look(i) if mean is None else style.filter_look(i, linewidth=0.5)
+            look = style.filter_style(i) if mean is None else style.filter_style(i, linewidth=0.5)
             clock.plot(axes, first.x, first.values[i, :, k], **look)
             if mean is not None:
-                clock.plot(axes, mean.x, mean.values[i, :, k], **style.filter_look(i))
+                clock.plot(axes, mean.x, mean.values[i, :, k], **style.filter_style(i))
         axes.set(ylim=(-0.03, 1.03))
     keys: list[Line2D | Patch] = [style.filter_keys(filters)[i] for i in stating]
     if true is not None and np.any(true):

@@ -49,7 +49,7 @@ def curves(solution: xr.Dataset, block: str) -> Picture:
     order = np.argsort(places)
     for i in range(len(filters)):
         at = places[order]
-        axes.plot(at, rms[i, order, 0], marker="o", markersize=3.5, **style.filter_look(i))
+        axes.plot(at, rms[i, order, 0], marker="o", markersize=3.5, **style.filter_style(i))
         axes.fill_between(
             at, low[i, order, 0], high[i, order, 0], color=style.colour(i), alpha=0.18, linewidth=0
         )

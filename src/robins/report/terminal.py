@@ -27,7 +27,9 @@ def table(summary: Summary, width: int = 100) -> Group:
     labels = [str(numbers.label(name)) for name in names]
     cells = {f: [numbers.marked(v, name) for name in names] for f, v in filters.items()}
     if sentence := summary.get("verdict"):
-        parts.append(Text(sentence, style=f"bold {_COLOURS.get(numbers.state_of(sentence), '')}"))
+        parts.append(
+            Text(sentence, style=f"bold {_COLOURS.get(numbers.verdict_class(sentence), '')}")
+        )
     for group in _groups(cells, width - max(map(len, labels), default=0)) if names else ():
         metrics = _new("metric")
         for name in group:

@@ -101,7 +101,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
                 reach = 3.0 * sigma.values[i, :, k]
                 shown.append(np.where(np.isfinite(y), reach, np.nan))
                 for sign in (-1.0, 1.0):
-                    clock.plot(axes, data.x, sign * reach, **style.filter_look(i, linewidth=0.8))
+                    clock.plot(axes, data.x, sign * reach, **style.filter_style(i, linewidth=0.8))
         _compress(axes, shown)
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
     keys: list[Any] = [_dot(filters[i], i) for i in present]
@@ -182,7 +182,7 @@ def _statistic(
     joined = _is_smooth(array)
     for i in range(len(filters)):
         if joined:
-            axes.plot(*series.thin(x, values[i]), **style.filter_look(i, linewidth=0.9))
+            axes.plot(*series.thin(x, values[i]), **style.filter_style(i, linewidth=0.9))
         else:
             _points(axes, x, values[i], i)
     if limits is None or not np.isfinite(limits.high).any():

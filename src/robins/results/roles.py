@@ -42,7 +42,7 @@ class Role(NamedTuple):
         """Default long name of an array of an object."""
         return self.text.partition(";")[0].format(of=of.replace("_", " "))
 
-    def called(self, of: str) -> str:
+    def array_name(self, of: str) -> str:
         """Name of the array of an object."""
         head, _, tail = self._parts
         return f"{head}{of}{tail}"
@@ -227,7 +227,7 @@ def row(role: str, of: str) -> Role:
     """
     rows = [r for r in ROLES if r.name == role]
     for one in rows:
-        if one.of(one.called(of)) == of:
+        if one.of(one.array_name(of)) == of:
             return one
     known = ", ".join(r.variable for r in rows)
     names = ", ".join(dict.fromkeys(r.name for r in ROLES))
@@ -246,9 +246,9 @@ def fault(name: str, array: xr.Variable | xr.DataArray) -> str:
         one = row(array.attrs["role"], array.attrs.get("of", ""))
     except ValueError as error:
         return str(error)
-    called = one.called(array.attrs.get("of", ""))
-    if name != called:
-        return f"by its role it is called {called}"
+    array_name = one.array_name(array.attrs.get("of", ""))
+    if name != array_name:
+        return f"by its role it is called {array_name}"
     if _MORE not in one.dims and len(one.dims.split()) != array.ndim:
         return f"has dimensions {', '.join(map(str, array.dims))}, not {one.dims}"
     missing = [attr for attr in one.attrs if attr not in array.attrs]

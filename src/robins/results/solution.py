@@ -69,7 +69,7 @@ def array(
     text = long_name or row.long_name(of)
     about = {"role": role} | ({"of": of} if of else {}) | attrs
     made = variable(names, values, unit or row.unit, text, frame, **about)
-    name = row.called(of)
+    name = row.array_name(of)
     if wrong := roles.fault(name, made) or ("" if made.attrs["units"] else "has no unit"):
         raise ValueError(f"{name}: {wrong}")
     labels = {names[-1]: xr.Variable(names[-1], list(axes))} if axes else {}

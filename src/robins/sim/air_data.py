@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
-from robins.sim import _given
+from robins.sim import _arguments
 from robins.sim.random import gauss_markov
 
 # Streams folded into the key; part of the file format, as `robins.sim.random.Component` is.
@@ -23,7 +23,7 @@ _AIR, _WIND = 0, 1
 
 
 def observe_air(
-    key: Array, v_air_b: _given.Listed, sigma_m_s: _given.Listed, present: _given.Listed
+    key: Array, v_air_b: _arguments.Listed, sigma_m_s: _arguments.Listed, present: _arguments.Listed
 ) -> Float[Array, "epochs 3"]:
     """Velocity through the air as measured, with white noise on each axis [m/s].
 
@@ -36,16 +36,16 @@ def observe_air(
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.
     """
-    there = _given.presence(present)
+    there = _arguments.presence(present)
     count = len(there)
-    true = _given.rows("v_air_b", v_air_b, count, 3)
-    sigma = _given.vector("sigma_m_s", sigma_m_s, 3, low=0.0)
+    true = _arguments.rows("v_air_b", v_air_b, count, 3)
+    sigma = _arguments.vector("sigma_m_s", sigma_m_s, 3, low=0.0)
     measured = true + sigma[None] * jax.random.normal(jax.random.fold_in(key, _AIR), (count, 3))
     return jnp.where(there[:, None], measured, jnp.nan)
 
 
 def wind_estimate_error(
-    key: Array, count: int, step_s: Number, sigma_m_s: _given.Listed, tau_s: _given.Listed
+    key: Array, count: int, step_s: Number, sigma_m_s: _arguments.Listed, tau_s: _arguments.Listed
 ) -> Float[Array, "{count} 2"]:
     """Error of a wind estimate (E, 2) [m/s], symmetric, so of either sign convention.
 
@@ -62,7 +62,7 @@ def wind_estimate_error(
     Raises:
         ValueError: no sample, a negative sigma, a step or correlation time that is not positive.
     """
-    sigma = _given.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
+    sigma = _arguments.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
     return sigma[None] * gauss_markov(jax.random.fold_in(key, _WIND), count, 2, step_s, tau_s)
 
 
@@ -74,10 +74,10 @@ def observe_height(
     key: Array,
     height_m: Number,
     sigma_m: Number,
-    present: _given.Listed,
+    present: _arguments.Listed,
     bias_sigma_m: Number = 0.0,
     bias_tau_s: Number = math.inf,
-    step_s: _given.Listed | None = None,
+    step_s: _arguments.Listed | None = None,
 ) -> Float[Array, "epochs"]:
     """Measured height [m].
 
@@ -97,14 +97,14 @@ def observe_height(
         ValueError: shapes that do not fit together, a negative sigma, a correlation time or a step
             that is not positive, or a correlation time without a step.
     """
-    there = _given.presence(present)
+    there = _arguments.presence(present)
     count = len(there)
-    height = _given.rows("height_m", height_m, count)
-    _given.number("sigma_m", sigma_m, 0.0)
-    _given.number("bias_sigma_m", bias_sigma_m, 0.0)
-    _given.number("bias_tau_s", bias_tau_s, 0.0, above=True, endless=True)
+    height = _arguments.rows("height_m", height_m, count)
+    _arguments.number("sigma_m", sigma_m, 0.0)
+    _arguments.number("bias_sigma_m", bias_sigma_m, 0.0)
+    _arguments.number("bias_tau_s", bias_tau_s, 0.0, above=True, endless=True)
     if step_s is None:
-        if not (_given.known(bias_tau_s) and math.isinf(bias_tau_s)):
+        if not (_arguments.known(bias_tau_s) and math.isinf(bias_tau_s)):
             raise ValueError(f"bias_tau_s = {bias_tau_s} wants step_s, the time between epochs")
         step_s = 1.0  # not used by a constant bias
     white = jax.random.normal(jax.random.fold_in(key, _WHITE), (count,))

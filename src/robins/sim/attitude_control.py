@@ -27,7 +27,7 @@ from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.linalg import scalars as u
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
-from robins.sim import _given
+from robins.sim import _arguments
 
 _ENOUGH = 1e-6  # least determinant of W W' for unit axes that span space
 
@@ -42,18 +42,18 @@ class Controller(NamedTuple):
 
 
 def controller(
-    inertia_b: _given.Listed, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
+    inertia_b: _arguments.Listed, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
 ) -> Controller:
     """Make a `Controller` after checking its numbers.
 
     Raises:
         ValueError: an inertia that is not of shape (3, 3) and finite, or a gain that is negative.
     """
-    J = _given.rows("inertia_b", inertia_b, 3, 3)
-    _given.number("inertia_b", J)
-    _given.number("wn", wn, 0.0, above=True)
-    _given.number("zeta", zeta, 0.0)
-    _given.number("desaturation_k", desaturation_k, 0.0)
+    J = _arguments.rows("inertia_b", inertia_b, 3, 3)
+    _arguments.number("inertia_b", J)
+    _arguments.number("wn", wn, 0.0, above=True)
+    _arguments.number("zeta", zeta, 0.0)
+    _arguments.number("desaturation_k", desaturation_k, 0.0)
     gains = (jnp.asarray(x, float) for x in (wn, zeta, desaturation_k))
     return Controller(J, *gains)
 
@@ -131,7 +131,9 @@ def allocate_within(
     return jnp.where(jnp.any(free != used), demanded, plain)
 
 
-def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -> np.ndarray:
+def allocation_matrix(
+    wheel_axes_b: _arguments.Listed, works: _arguments.Listed = 1.0
+) -> np.ndarray:
     """Least-norm allocation matrix (W, 3) of a body torque to the wheels that work.
 
     Args:
@@ -144,7 +146,7 @@ def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -
     axes = np.asarray(wheel_axes_b, float)
     if axes.ndim != 2 or axes.shape[0] != 3:
         raise ValueError(f"wheel_axes_b must have shape (3, W), got {axes.shape}")
-    there = np.asarray(_given.vector("works", works, axes.shape[1], low=0.0, high=1.0))
+    there = np.asarray(_arguments.vector("works", works, axes.shape[1], low=0.0, high=1.0))
     left = axes * there
     rank = np.linalg.matrix_rank(left, tol=1e-6) if left.size else 0
     if rank < 3:

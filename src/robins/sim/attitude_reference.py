@@ -20,7 +20,7 @@ from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.filters.values import Numbers
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
-from robins.sim import _given
+from robins.sim import _arguments
 from robins.sim.orbit import OrbitStates
 
 
@@ -53,21 +53,21 @@ def nadir(orbit: OrbitStates) -> Reference:
     )
 
 
-def inertial(q_ib: _given.Listed, time_s: Numbers) -> Reference:
+def inertial(q_ib: _arguments.Listed, time_s: Numbers) -> Reference:
     """Inertially fixed reference: one attitude at all times.
 
     Raises:
         ValueError: not a unit quaternion.
     """
     still = jnp.zeros((len(time_s), 3))
-    q = _given.unit_quaternion("q_ib", q_ib)
+    q = _arguments.unit_quaternion("q_ib", q_ib)
     return Reference(jnp.tile(q, (len(time_s), 1)), still, still)
 
 
 def slews(
     base: Reference,
-    amplitude_rad: _given.Listed,
-    period_s: _given.Listed,
+    amplitude_rad: _arguments.Listed,
+    period_s: _arguments.Listed,
     time_s: Number,
     phase_rad: Number = 0.0,
     fade_in_s: float = 0.0,
@@ -89,12 +89,12 @@ def slews(
     Raises:
         ValueError: a number is out of range, or the times do not fit the base.
     """
-    amplitude = _given.vector("amplitude_rad", amplitude_rad, 3)
-    period = _given.vector("period_s", period_s, 3, low=0.0, above=True)
-    phase = _given.vector("phase_rad", phase_rad, 3)
-    _given.number("fade_in_s", fade_in_s, 0.0)
-    time = _given.rows("time_s", time_s, base.q_ib.shape[0])
-    _given.number("time_s", time)
+    amplitude = _arguments.vector("amplitude_rad", amplitude_rad, 3)
+    period = _arguments.vector("period_s", period_s, 3, low=0.0, above=True)
+    phase = _arguments.vector("phase_rad", phase_rad, 3)
+    _arguments.number("fade_in_s", fade_in_s, 0.0)
+    time = _arguments.rows("time_s", time_s, base.q_ib.shape[0])
+    _arguments.number("time_s", time)
     return _slewing(base, amplitude, period, time - time[0], phase, float(fade_in_s))
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM, OMEGA_E, dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
-from robins.sim import _given
+from robins.sim import _arguments
 
 _ROUNDS = 30  # iterations of Kepler's equation, each at least as good as a bisection
 
@@ -38,13 +38,13 @@ class BallisticPath(NamedTuple):
 
 
 def ballistic(
-    lat_rad: _given.Listed,
-    lon_rad: _given.Listed,
-    alt_m: _given.Listed,
-    speed_m_s: _given.Listed,
-    elevation_rad: _given.Listed,
-    azimuth_rad: _given.Listed,
-    time_s: _given.Listed,
+    lat_rad: _arguments.Listed,
+    lon_rad: _arguments.Listed,
+    alt_m: _arguments.Listed,
+    speed_m_s: _arguments.Listed,
+    elevation_rad: _arguments.Listed,
+    azimuth_rad: _arguments.Listed,
+    time_s: _arguments.Listed,
 ) -> BallisticPath:
     """Ballistic flight from a launch site with a given inertial velocity.
 
@@ -70,13 +70,13 @@ def ballistic(
     if time.ndim != 1 or len(time) < 1:
         raise ValueError(f"time_s must have shape (E,), E at least one, got {time.shape}")
     quarter = 0.5 * np.pi
-    _given.number("lat_rad", lat_rad, -quarter, quarter)
-    _given.number("lon_rad", lon_rad)
-    _given.number("alt_m", alt_m, -1e4)
-    _given.number("speed_m_s", speed_m_s, 0.0, above=True)
-    _given.number("elevation_rad", elevation_rad, 0.0, quarter, above=True)
-    _given.number("azimuth_rad", azimuth_rad)
-    _given.number("time_s", time, 0.0)
+    _arguments.number("lat_rad", lat_rad, -quarter, quarter)
+    _arguments.number("lon_rad", lon_rad)
+    _arguments.number("alt_m", alt_m, -1e4)
+    _arguments.number("speed_m_s", speed_m_s, 0.0, above=True)
+    _arguments.number("elevation_rad", elevation_rad, 0.0, quarter, above=True)
+    _arguments.number("azimuth_rad", azimuth_rad)
+    _arguments.number("time_s", time, 0.0)
 
     launch = (lat_rad, lon_rad, alt_m, speed_m_s, elevation_rad, azimuth_rad)
     path, r0, v0 = _path(*(jnp.asarray(x, float) for x in launch), time)
@@ -147,7 +147,7 @@ def _fly(r0, v0, time):
 
 
 def _refuse_no_return(r0, v0, time) -> None:
-    if not _given.known(r0, v0, time):
+    if not _arguments.known(r0, v0, time):
         return
     r0, v0 = np.asarray(r0), np.asarray(v0)
     radius, speed = np.linalg.norm(r0), np.linalg.norm(v0)

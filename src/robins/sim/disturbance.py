@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.errors import require
 from robins.filters.belief import Number
-from robins.sim import _given
+from robins.sim import _arguments
 
 
 def outlier_factor(
@@ -30,9 +30,9 @@ def outlier_factor(
     Raises:
         ValueError: a share beyond 0 to 1, or a negative factor.
     """
-    if _given.known(share):
+    if _arguments.known(share):
         require(0.0 <= share <= 1.0, f"share is {share}; it must be from 0 to 1")
-    if _given.known(factor):
+    if _arguments.known(factor):
         require(factor >= 0.0, f"factor is {factor}; it must not be negative")
     struck = jax.random.uniform(key, tuple(shape)) < share
     return jnp.where(struck, jnp.asarray(factor, float), 1.0)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.rotation import from_euler, from_rotvec, multiply, normalise
-from robins.sim import _given
+from robins.sim import _arguments
 
 
 class FreeBody(NamedTuple):
@@ -63,13 +63,13 @@ def free_body(
     Raises:
         ValueError: shapes that do not fit, or a number out of its range.
     """
-    _given.count_of("steps", steps)
-    _given.number("dt_s", dt_s, 0.0, above=True)
-    _given.number("torque_noise", torque_noise, 0.0)
+    _arguments.count_of("steps", steps)
+    _arguments.number("dt_s", dt_s, 0.0, above=True)
+    _arguments.number("torque_noise", torque_noise, 0.0)
     _refuse_impossible(body)
-    q0, omega0 = _given.rows("q0_nb", q0_nb, 4), _given.rows("omega0_b", omega0_b, 3)
-    _given.number("q0_nb must be a unit quaternion: its length", jnp.sqrt(q0 @ q0), 0.99, 1.01)
-    _given.number("omega0_b", omega0)
+    q0, omega0 = _arguments.rows("q0_nb", q0_nb, 4), _arguments.rows("omega0_b", omega0_b, 3)
+    _arguments.number("q0_nb must be a unit quaternion: its length", jnp.sqrt(q0 @ q0), 0.99, 1.01)
+    _arguments.number("omega0_b", omega0)
     q0 = normalise(q0)
     e1, e2, e3, dt, noise = (jnp.asarray(x, float) for x in (*body, dt_s, torque_noise))
 
@@ -123,11 +123,11 @@ def coning_start(
             of its range.
     """
     quarter = 0.5 * np.pi
-    _given.number("spin_rad_s", spin_rad_s, 0.0, above=True)
-    _given.number("cone_half_angle_rad", cone_half_angle_rad, 0.0, 0.999 * quarter)
-    _given.number("momentum_elevation_rad", momentum_elevation_rad, -quarter, quarter)
-    _given.number("momentum_azimuth_rad", momentum_azimuth_rad)
-    _given.number("phase_rad", phase_rad)
+    _arguments.number("spin_rad_s", spin_rad_s, 0.0, above=True)
+    _arguments.number("cone_half_angle_rad", cone_half_angle_rad, 0.0, 0.999 * quarter)
+    _arguments.number("momentum_elevation_rad", momentum_elevation_rad, -quarter, quarter)
+    _arguments.number("momentum_azimuth_rad", momentum_azimuth_rad)
+    _arguments.number("phase_rad", phase_rad)
     _refuse_impossible(body)
     spin, cone, phase, e1 = (
         jnp.asarray(x, float) for x in (spin_rad_s, cone_half_angle_rad, phase_rad, body.e1)
@@ -149,6 +149,6 @@ def _mean_decay(x):
 
 
 def _refuse_impossible(body: FreeBody) -> None:
-    _given.number("e1", body.e1, -1.0, np.nextafter(1.0, 0.0))
-    _given.number("e2", body.e2, 0.0)
-    _given.number("e3", body.e3, 0.0)
+    _arguments.number("e1", body.e1, -1.0, np.nextafter(1.0, 0.0))
+    _arguments.number("e2", body.e2, 0.0)
+    _arguments.number("e3", body.e3, 0.0)

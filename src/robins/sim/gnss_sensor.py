@@ -26,7 +26,7 @@ from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, geodetic
 from robins.errors import require
 from robins.filters.values import value
 from robins.rotation import rotate
-from robins.sim import _given
+from robins.sim import _arguments
 
 # The draws at a fix are part of the file format, as `robins.sim.random.Component` is.
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
@@ -78,8 +78,8 @@ class GnssErrorModel:
             ("outlier_share", 0.0, 1.0),
             ("outlier_size", 0.0, np.inf),
         ):
-            _given.number(name, getattr(self, name), low, high)
-        _given.number("rate_hz", self.rate_hz, 0.0, above=True)
+            _arguments.number(name, getattr(self, name), low, high)
+        _arguments.number("rate_hz", self.rate_hz, 0.0, above=True)
         if self.outages_s is not None and len(self.outages_s) == 0:
             object.__setattr__(self, "outages_s", None)
         elif self.outages_s is not None:
@@ -97,7 +97,7 @@ class GnssErrorModel:
         x = np.asarray(value, float)
         if x.shape not in ((), (3,)):
             raise ValueError(f"{name} must be a number or of shape (3,), got shape {x.shape}")
-        _given.number(name, x, low, above=open_end)
+        _arguments.number(name, x, low, above=open_end)
         object.__setattr__(self, name, np.broadcast_to(x, (3,)))
 
 

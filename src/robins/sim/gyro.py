@@ -36,7 +36,7 @@ from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.rotation import conjugate, from_rotvec, multiply, normalise, to_rotvec
-from robins.sim import _given
+from robins.sim import _arguments
 from robins.sim.imu_sensor import corrupt, quantise
 from robins.sim.random import gauss_markov
 
@@ -68,8 +68,8 @@ def gyro_errors(key: Array, model: TriadErrors, count: int, dt_s: Number) -> Gyr
         ValueError: no sample, an interval that is not positive, or a model with a full scale, which
             is not simulated here.
     """
-    _given.count_of("count", count)
-    _given.number("dt_s", dt_s, 0.0, above=True)
+    _arguments.count_of("count", count)
+    _arguments.number("dt_s", dt_s, 0.0, above=True)
     if model.full_scale is not None:
         raise ValueError("gyro_errors simulates no full scale: give the model full_scale=None")
     dt = jnp.asarray(dt_s, float)
@@ -135,7 +135,7 @@ class MemsErrors(NamedTuple):
 
 
 def delta_angles(
-    key: Array, q_nb: _given.Listed, dt_s: Number, gyro: MemsGyro
+    key: Array, q_nb: _arguments.Listed, dt_s: Number, gyro: MemsGyro
 ) -> tuple[Float[Array, "samples 3"], MemsErrors]:
     """Angles [rad] that a triad reports over the E intervals between E + 1 attitudes, body axes.
 
@@ -158,12 +158,12 @@ def delta_angles(
     if q.ndim != 2 or q.shape[1] != 4 or len(q) < 2:
         raise ValueError(f"q_nb must have shape (E + 1, 4), E at least one, got {q.shape}")
     length = jnp.sqrt(jnp.sum(q * q, 1))
-    _given.number("q_nb must be unit quaternions: their length", length, 0.99, 1.01)
-    _given.number("dt_s", dt_s, 0.0, above=True)
-    bias = _given.vector("bias_rad_s", gyro.bias_rad_s, 3)
-    slow = _given.vector("markov_sigma_rad_s", gyro.markov_sigma_rad_s, 3, low=0.0)
-    white = _given.vector("white_rad_s", gyro.white_rad_s, 3, low=0.0)
-    scale = _given.vector("scale_factor", gyro.scale_factor, 3, low=-1.0, above=True)
+    _arguments.number("q_nb must be unit quaternions: their length", length, 0.99, 1.01)
+    _arguments.number("dt_s", dt_s, 0.0, above=True)
+    bias = _arguments.vector("bias_rad_s", gyro.bias_rad_s, 3)
+    slow = _arguments.vector("markov_sigma_rad_s", gyro.markov_sigma_rad_s, 3, low=0.0)
+    white = _arguments.vector("white_rad_s", gyro.white_rad_s, 3, low=0.0)
+    scale = _arguments.vector("scale_factor", gyro.scale_factor, 3, low=-1.0, above=True)
 
     count, dt = len(q) - 1, jnp.asarray(dt_s, float)
     sign = jax.random.rademacher(jax.random.fold_in(key, _SIGN), (3,), float)
@@ -177,7 +177,7 @@ def delta_angles(
     return reported, MemsErrors(bias, drift, noise, scale)
 
 
-def integrate_angles(q0_nb: Number, theta_b: _given.Listed) -> Float[Array, "epochs 4"]:
+def integrate_angles(q0_nb: Number, theta_b: _arguments.Listed) -> Float[Array, "epochs 4"]:
     """Attitude (E + 1, 4) integrated from q0_nb by delta angles (E, 3) [rad].
 
     The `delta_angles` of a perfect gyro reproduce the attitudes they were computed from.
@@ -190,7 +190,7 @@ def integrate_angles(q0_nb: Number, theta_b: _given.Listed) -> Float[Array, "epo
         q = normalise(multiply(q, from_rotvec(theta)))
         return q, q
 
-    start = normalise(_given.rows("q0_nb", q0_nb, 4))
+    start = normalise(_arguments.rows("q0_nb", q0_nb, 4))
     theta = jnp.asarray(theta_b, float)
     if theta.ndim != 2 or theta.shape[1] != 3:
         raise ValueError(f"theta_b must have shape (E, 3), got {theta.shape}")

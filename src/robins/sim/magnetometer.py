@@ -25,24 +25,24 @@ from robins.errors import require
 from robins.filters.belief import Number
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, normalise, rotate
-from robins.sim import _given
+from robins.sim import _arguments
 
 _ROUNDING_S = 1e-6  # a sample within this of the edge of a burst is on it
 
 
 def observe_field(
     key: Array,
-    q_nb: _given.Listed,
-    field_n: _given.Listed,
-    sigma_t: _given.Listed,
-    present: _given.Listed,
+    q_nb: _arguments.Listed,
+    field_n: _arguments.Listed,
+    sigma_t: _arguments.Listed,
+    present: _arguments.Listed,
     *,
-    turn: _given.Listed | None = None,
-    added_n_t: _given.Listed | None = None,
-    added_b_t: _given.Listed | None = None,
-    q_bs: _given.Listed | None = None,
+    turn: _arguments.Listed | None = None,
+    added_n_t: _arguments.Listed | None = None,
+    added_b_t: _arguments.Listed | None = None,
+    q_bs: _arguments.Listed | None = None,
     soft_iron: Number | None = None,
-    hard_iron_t: _given.Listed | None = None,
+    hard_iron_t: _arguments.Listed | None = None,
     range_t: Number | None = None,
     quantum_t: Number | None = None,
 ) -> Float[Array, "epochs 3"]:
@@ -70,23 +70,23 @@ def observe_field(
         ValueError: shapes that do not fit together, a negative sigma, a range or quantum that is
             not positive.
     """
-    there = _given.presence(present)
+    there = _arguments.presence(present)
     count = len(there)
-    q = _given.rows("q_nb", q_nb, count, 4)
+    q = _arguments.rows("q_nb", q_nb, count, 4)
     field = _vectors("field_n", field_n, count)
     if turn is not None:
-        field = _rotated(field, _given.rows("turn", turn, count, 3))
+        field = _rotated(field, _arguments.rows("turn", turn, count, 3))
     if added_n_t is not None:
         field = field + _vectors("added_n_t", added_n_t, count)
     z = rotate(conjugate(q), field)
     if added_b_t is not None:
         z = z + _vectors("added_b_t", added_b_t, count)
     if q_bs is not None:
-        z = rotate(conjugate(normalise(_given.rows("q_bs", q_bs, 4))), z)
+        z = rotate(conjugate(normalise(_arguments.rows("q_bs", q_bs, 4))), z)
     if soft_iron is not None:
-        z = z @ _given.rows("soft_iron", soft_iron, 3, 3).T
+        z = z @ _arguments.rows("soft_iron", soft_iron, 3, 3).T
     if hard_iron_t is not None:
-        z = z + _given.rows("hard_iron_t", hard_iron_t, 3)[None]
+        z = z + _arguments.rows("hard_iron_t", hard_iron_t, 3)[None]
     z = z + _sigma(sigma_t, count) * jax.random.normal(key, (count, 3))
     return jnp.where(there[:, None], _converted(z, range_t, quantum_t), jnp.nan)
 
@@ -94,10 +94,10 @@ def observe_field(
 def _converted(z: Array, range_t: Number | None, quantum_t: Number | None) -> Array:
     """Output of the A/D converter: rounded and saturated."""
     if quantum_t is not None:
-        _given.number("quantum_t", quantum_t, 0.0, above=True)
+        _arguments.number("quantum_t", quantum_t, 0.0, above=True)
         z = quantum_t * jnp.round(z / quantum_t)
     if range_t is not None:
-        _given.number("range_t", range_t, 0.0, above=True)
+        _arguments.number("range_t", range_t, 0.0, above=True)
         z = jnp.clip(z, -range_t, range_t)
     return z
 
@@ -105,9 +105,9 @@ def _converted(z: Array, range_t: Number | None, quantum_t: Number | None) -> Ar
 def observe_magnetic_attitude(
     key: Array,
     euler_rad: Number,
-    sigma_rad: _given.Listed,
-    disturbance_rad: _given.Listed | None = None,
-    present: _given.Listed | None = None,
+    sigma_rad: _arguments.Listed,
+    disturbance_rad: _arguments.Listed | None = None,
+    present: _arguments.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Roll, pitch, heading [rad] of the fictitious "magnetic attitude" sensor of papers.
 
@@ -124,13 +124,13 @@ def observe_magnetic_attitude(
         ValueError: shapes that do not fit together, or a negative sigma.
     """
     count = len(jnp.asarray(euler_rad, float))
-    true = _given.rows("euler_rad", euler_rad, count, 3)
-    there = _given.presence(jnp.ones(count, bool) if present is None else present)
+    true = _arguments.rows("euler_rad", euler_rad, count, 3)
+    there = _arguments.presence(jnp.ones(count, bool) if present is None else present)
     require(len(there) == count, f"present must have shape ({count},)", there.shape)
-    sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
+    sigma = _arguments.vector("sigma_rad", sigma_rad, 3, low=0.0)
     measured = true + sigma[None] * jax.random.normal(key, (count, 3))
     if disturbance_rad is not None:
-        measured = measured + _given.rows("disturbance_rad", disturbance_rad, count, 3)
+        measured = measured + _arguments.rows("disturbance_rad", disturbance_rad, count, 3)
     return jnp.where(there[:, None], wrap(measured), jnp.nan)
 
 
@@ -140,7 +140,7 @@ def angle_bursts(
     size_rad: Number,
     every_s: Number,
     length_s: Number,
-    first_s: _given.Listed | None = None,
+    first_s: _arguments.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Bursts of disturbance of three angles [rad]: of a fixed size, signs drawn by angle and burst.
 
@@ -159,7 +159,7 @@ def angle_bursts(
         ValueError: a period or length that is not positive.
     """
     active, number = bursts(time_s, every_s, length_s, first_s)
-    size = _given.vector("size_rad", size_rad, 3)
+    size = _arguments.vector("size_rad", size_rad, 3)
     signs = jax.vmap(lambda k: jax.random.rademacher(jax.random.fold_in(key, k), (3,), float))
     return jnp.where(active[:, None], size[None] * signs(number), 0.0)
 
@@ -170,7 +170,7 @@ def field_bursts(
     size_rad: Number,
     every_s: Number,
     length_s: Number,
-    first_s: _given.Listed | None = None,
+    first_s: _arguments.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Rotations of the field (E, 3) [rad] for `observe_field`, one axis drawn for each burst.
 
@@ -181,7 +181,7 @@ def field_bursts(
         ValueError: a period or length that is not positive.
     """
     active, number = bursts(time_s, every_s, length_s, first_s)
-    _given.number("size_rad", size_rad)
+    _arguments.number("size_rad", size_rad)
     drawn = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(key, k), (3,)))(number)
     length = jnp.sqrt(jnp.sum(drawn * drawn, 1, keepdims=True))
     return jnp.where(active[:, None], size_rad * drawn / length, 0.0)
@@ -191,8 +191,8 @@ def bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
     """Membership of each sample in a burst (E,), and the number of the last burst started (E,)."""
     time = jnp.asarray(time_s, float)
     require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
-    _given.number("every_s", every_s, 0.0, above=True, endless=True)
-    _given.number("length_s", length_s, 0.0, above=True, endless=True)
+    _arguments.number("every_s", every_s, 0.0, above=True, endless=True)
+    _arguments.number("length_s", length_s, 0.0, above=True, endless=True)
     since = time - (every_s if first_s is None else first_s) + _ROUNDING_S
     number = jnp.maximum(jnp.floor(since / every_s), 0.0)
     begun = jnp.where(number > 0.0, number, 1.0) * every_s  # avoids 0 times infinity
@@ -211,15 +211,17 @@ def _rotated(field: Array, turn: Array) -> Array:
     return rotate(from_rotvec(jnp.where(turns, ratio * across, 0.0)), field)
 
 
-def _vectors(name: str, value: _given.Listed, count: int) -> Array:
+def _vectors(name: str, value: _arguments.Listed, count: int) -> Array:
     x = jnp.asarray(value, float)
-    return jnp.broadcast_to(x, (count, 3)) if x.shape == (3,) else _given.rows(name, x, count, 3)
+    return (
+        jnp.broadcast_to(x, (count, 3)) if x.shape == (3,) else _arguments.rows(name, x, count, 3)
+    )
 
 
 def _sigma(sigma_t: Number, count: int) -> Array:
     """(E, 3) or (1, 3)."""
     sigma = jnp.asarray(sigma_t, float)
     if sigma.shape in ((), (3,)):
-        return _given.vector("sigma_t", sigma_t, 3, low=0.0)[None]
-    _given.number("sigma_t", sigma_t, 0.0)
-    return jnp.broadcast_to(_given.rows("sigma_t", sigma, count)[:, None], (count, 3))
+        return _arguments.vector("sigma_t", sigma_t, 3, low=0.0)[None]
+    _arguments.number("sigma_t", sigma_t, 0.0)
+    return jnp.broadcast_to(_arguments.rows("sigma_t", sigma, count)[:, None], (count, 3))

@@ -20,7 +20,7 @@ from robins.earth.magnetic import RADIUS_M, field_along, wmm_for
 from robins.earth.wgs84 import A_M, GM, OMEGA_E, dcm_en, geodetic_from_ecef
 from robins.errors import require
 from robins.filters.belief import Number
-from robins.sim import _given
+from robins.sim import _arguments
 
 LOWEST_M = 100e3  # lowest height of an orbit
 
@@ -55,13 +55,13 @@ def circular_orbit(
     Raises:
         ValueError: a number out of its range, or times that are not a list.
     """
-    _given.number("alt_m (height above the Earth [m]; is it in km?)", alt_m, LOWEST_M)
-    _given.number("incl_rad (is it in degrees?)", incl_rad, 0.0, np.pi)
-    _given.number("raan_rad", raan_rad)
-    _given.number("arg_lat_rad", arg_lat_rad)
+    _arguments.number("alt_m (height above the Earth [m]; is it in km?)", alt_m, LOWEST_M)
+    _arguments.number("incl_rad (is it in degrees?)", incl_rad, 0.0, np.pi)
+    _arguments.number("raan_rad", raan_rad)
+    _arguments.number("arg_lat_rad", arg_lat_rad)
     time = jnp.asarray(time_s, float)
     require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
-    _given.number("time_s", time)
+    _arguments.number("time_s", time)
     elements = (jnp.asarray(x, float) for x in (alt_m, incl_rad, raan_rad, arg_lat_rad))
     return OrbitStates(time, *_circular(*elements, time))
 

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
-from robins.sim import _given
+from robins.sim import _arguments
 
 UNITS_OF_A_KIND = 256  # stride between the stream numbers of two sensors of one kind
 
@@ -96,7 +96,7 @@ def _bounded(name: str, value: Any, limit: int) -> int:
 
 
 def gauss_markov(
-    key: Array, count: int, width: int, step_s: Number, tau_s: _given.Listed
+    key: Array, count: int, width: int, step_s: Number, tau_s: _arguments.Listed
 ) -> Float[Array, "{count} {width}"]:
     """Independent processes of unit variance, started in their steady state.
 
@@ -112,9 +112,9 @@ def gauss_markov(
     Raises:
         ValueError: no sample, a step or a correlation time that is not positive.
     """
-    _given.count_of("count", count)
-    _given.number("step_s", step_s, 0.0, above=True)
-    tau = _given.vector("tau_s", tau_s, width, low=0.0, above=True, endless=True)
+    _arguments.count_of("count", count)
+    _arguments.number("step_s", step_s, 0.0, above=True)
+    tau = _arguments.vector("tau_s", tau_s, width, low=0.0, above=True, endless=True)
     normal = jax.random.normal(key, (count, width))
     x = step_s / tau
     fade, drive = jnp.exp(-x), jnp.sqrt(-jnp.expm1(-2.0 * x))

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.rotation import from_rotvec, multiply, normalise
-from robins.sim import _given
+from robins.sim import _arguments
 
 _GAUSS = np.sqrt(3.0) / 6.0  # of a step, from its middle to its two Gauss points
 
@@ -46,9 +46,9 @@ class TableState(NamedTuple):
 
 
 def rate_table(
-    lag_s: _given.Listed = 0.02,
-    rate_limit_rad_s: _given.Listed = np.inf,
-    acceleration_limit_rad_s2: _given.Listed = np.inf,
+    lag_s: _arguments.Listed = 0.02,
+    rate_limit_rad_s: _arguments.Listed = np.inf,
+    acceleration_limit_rad_s2: _arguments.Listed = np.inf,
 ) -> RateTable:
     """Make a `RateTable` after checking its numbers, one for all axes or three; infinity: no limit.
 
@@ -61,20 +61,22 @@ def rate_table(
         "acceleration_limit_rad_s2": acceleration_limit_rad_s2,
     }
     return RateTable(
-        _given.vector("lag_s", lag_s, 3, **positive),
-        *(_given.vector(name, x, 3, endless=True, **positive) for name, x in limits.items()),
+        _arguments.vector("lag_s", lag_s, 3, **positive),
+        *(_arguments.vector(name, x, 3, endless=True, **positive) for name, x in limits.items()),
     )
 
 
 def table_state(
-    q_ib: _given.Listed = (1.0, 0.0, 0.0, 0.0), rate_b: _given.Listed = 0.0
+    q_ib: _arguments.Listed = (1.0, 0.0, 0.0, 0.0), rate_b: _arguments.Listed = 0.0
 ) -> TableState:
     """The state of a given attitude and rate [rad/s].
 
     Raises:
         ValueError: not a unit quaternion, or a rate that is not finite.
     """
-    return TableState(_given.unit_quaternion("q_ib", q_ib), _given.vector("rate_b", rate_b, 3))
+    return TableState(
+        _arguments.unit_quaternion("q_ib", q_ib), _arguments.vector("rate_b", rate_b, 3)
+    )
 
 
 def step(

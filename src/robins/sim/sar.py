@@ -23,7 +23,7 @@ from robins import _float64  # noqa: F401
 from robins.earth import Geodetic
 from robins.filters.belief import Number
 from robins.manifold import wrap
-from robins.sim import _given
+from robins.sim import _arguments
 
 # Streams folded into the key; part of the file format, as `robins.sim.random.Component` is.
 _NOISE, _STRUCK, _OFFSET = 0, 1, 2
@@ -52,7 +52,7 @@ def observe_sar(
     key: jax.Array,
     position: Geodetic,
     heading_rad: Number,
-    present: _given.Listed,
+    present: _arguments.Listed,
 ) -> SarFix:
     """Fixes of a run from its true motion.
 
@@ -67,19 +67,19 @@ def observe_sar(
         ValueError: shapes that do not fit together, a negative sigma, factor or offset, or a share
             beyond 0 to 1.
     """
-    there = _given.presence(present)
+    there = _arguments.presence(present)
     count = len(there)
-    heading = _given.rows("heading_rad", heading_rad, count)
+    heading = _arguments.rows("heading_rad", heading_rad, count)
     place = Geodetic(
-        _given.rows("position.lat", position.lat, count),
-        _given.rows("position.lon", position.lon, count),
-        _given.rows("position.alt", position.alt, count),
+        _arguments.rows("position.lat", position.lat, count),
+        _arguments.rows("position.lon", position.lon, count),
+        _arguments.rows("position.alt", position.alt, count),
     )
-    sigma_m = _given.vector("sigma_m", model.sigma_m, 2, low=0.0)
-    _given.number("heading_sigma_rad", model.heading_sigma_rad, 0.0)
-    _given.number("outlier_share", model.outlier_share, 0.0, 1.0)
-    _given.number("outlier_factor", model.outlier_factor, 0.0)
-    _given.number("outlier_offset", model.outlier_offset, 0.0)
+    sigma_m = _arguments.vector("sigma_m", model.sigma_m, 2, low=0.0)
+    _arguments.number("heading_sigma_rad", model.heading_sigma_rad, 0.0)
+    _arguments.number("outlier_share", model.outlier_share, 0.0, 1.0)
+    _arguments.number("outlier_factor", model.outlier_factor, 0.0)
+    _arguments.number("outlier_offset", model.outlier_offset, 0.0)
 
     noise = jax.random.normal(jax.random.fold_in(key, _NOISE), (count, 3))
     struck = jax.random.uniform(jax.random.fold_in(key, _STRUCK), (count,)) < model.outlier_share

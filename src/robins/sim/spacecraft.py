@@ -35,7 +35,7 @@ from robins.errors import require
 from robins.filters.belief import Number
 from robins.linalg import scalars as u
 from robins.rotation import conjugate, rotate
-from robins.sim import _given
+from robins.sim import _arguments
 
 
 class Spacecraft(NamedTuple):
@@ -59,13 +59,13 @@ class CraftState(NamedTuple):
 
 
 def spacecraft(
-    inertia_b: _given.Listed,
-    wheel_axes_b: _given.Listed,
-    wheel_torque_limit: _given.Listed,
-    wheel_momentum_limit: _given.Listed,
-    dipole_limit_a_m2: _given.Listed,
-    residual_dipole_b: _given.Listed = 0.0,
-    wheel_works: _given.Listed = 1.0,
+    inertia_b: _arguments.Listed,
+    wheel_axes_b: _arguments.Listed,
+    wheel_torque_limit: _arguments.Listed,
+    wheel_momentum_limit: _arguments.Listed,
+    dipole_limit_a_m2: _arguments.Listed,
+    residual_dipole_b: _arguments.Listed = 0.0,
+    wheel_works: _arguments.Listed = 1.0,
 ) -> Spacecraft:
     """Make a `Spacecraft` after checking its numbers; one number stands for all wheels or axes.
 
@@ -94,16 +94,16 @@ def spacecraft(
             "axes have length one"
         )
     wheels = axes.shape[1]
-    works = _given.vector("wheel_works", wheel_works, wheels, low=0.0, high=1.0)
+    works = _arguments.vector("wheel_works", wheel_works, wheels, low=0.0, high=1.0)
     if not np.all(np.isin(works, (0.0, 1.0))):
         raise ValueError(f"wheel_works must be 0 or 1 for each wheel, got {wheel_works}")
     return Spacecraft(
         jnp.asarray(_inertia(inertia_b)),
         jnp.asarray(axes),
-        _given.vector("wheel_torque_limit", wheel_torque_limit, wheels, low=0.0),
-        _given.vector("wheel_momentum_limit", wheel_momentum_limit, wheels, low=0.0),
-        _given.vector("dipole_limit_a_m2", dipole_limit_a_m2, 3, low=0.0),
-        _given.vector("residual_dipole_b", residual_dipole_b, 3),
+        _arguments.vector("wheel_torque_limit", wheel_torque_limit, wheels, low=0.0),
+        _arguments.vector("wheel_momentum_limit", wheel_momentum_limit, wheels, low=0.0),
+        _arguments.vector("dipole_limit_a_m2", dipole_limit_a_m2, 3, low=0.0),
+        _arguments.vector("residual_dipole_b", residual_dipole_b, 3),
         works,
     )
 
@@ -126,16 +126,19 @@ def _inertia(inertia_b: Number) -> np.ndarray:
 
 
 def craft_state(
-    craft: Spacecraft, q_ib: _given.Listed, omega_b: _given.Listed, wheel_h: _given.Listed = 0.0
+    craft: Spacecraft,
+    q_ib: _arguments.Listed,
+    omega_b: _arguments.Listed,
+    wheel_h: _arguments.Listed = 0.0,
 ) -> CraftState:
     """State with a given attitude, rate omega_ib_b [rad/s] and momenta of the wheels [N m s].
 
     Raises:
         ValueError: shapes that do not fit, or a quaternion that is not of unit length.
     """
-    q, omega = _given.unit_quaternion("q_ib", q_ib), _given.rows("omega_b", omega_b, 3)
-    _given.number("omega_b", omega)
-    h = _given.vector("wheel_h", wheel_h, craft.wheel_axes_b.shape[1])
+    q, omega = _arguments.unit_quaternion("q_ib", q_ib), _arguments.rows("omega_b", omega_b, 3)
+    _arguments.number("omega_b", omega)
+    h = _arguments.vector("wheel_h", wheel_h, craft.wheel_axes_b.shape[1])
     total = _times(craft.inertia_b, omega) + wheel_momentum_b(craft, h)
     return CraftState(q, rotate(q, total), h)
 
@@ -232,21 +235,21 @@ def dynamics(
     # Within the step all components are in axes 0, the body axes at its beginning.
     C = u.dcm(u.scalars(state.q_ib))
     to_0 = u.transposed(C)
-    total, place, field = u.settled(
+    total, place, field = u.behind_barrier(
         *(u.apply(to_0, u.scalars(v)) for v in (state.momentum_i, r_i_m, field_i_t))
     )
 
     def slope(y, share):
         """Rates of (g, H - H0) in axes 0, a share of the step after its beginning."""
         g, added = y[:3], y[3:]
-        momentum, r_b, field_b = u.settled(
+        momentum, r_b, field_b = u.behind_barrier(
             *(_rotated(g, v, -1.0) for v in (u.plus(total, added), place, field))
         )
         wheels = u.plus(held, u.times(share, gained))
         torque = u.plus(gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
-        omega, torque = u.settled(u.apply(J_inv, u.minus(momentum, wheels)), torque)
+        omega, torque = u.behind_barrier(u.apply(J_inv, u.minus(momentum, wheels)), torque)
         along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
-        (rate,) = u.settled((*u.times(0.5, along), *_rotated(g, torque, 1.0)))
+        (rate,) = u.behind_barrier((*u.times(0.5, along), *_rotated(g, torque, 1.0)))
         return rate
 
     k1 = slope((0.0,) * 6, 0.0)

@@ -31,7 +31,7 @@ from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, multiply, normalise, rotate, to_euler
-from robins.sim import _given
+from robins.sim import _arguments
 
 # Folded into the key of the sensor; part of the file format, as `Component` is.
 _NOISE, _PHASE = 0, 1
@@ -44,10 +44,10 @@ ARCSEC = np.pi / 648e3
 
 def star_errors(
     key: Array,
-    sigma_rad: _given.Listed,
+    sigma_rad: _arguments.Listed,
     frame_s: Number,
     count: int,
-    low_frequency_rad: _given.Listed = 0.0,
+    low_frequency_rad: _arguments.Listed = 0.0,
     low_frequency_period_s: Number = 600.0,
 ) -> Float[Array, "{count} 3"]:
     """Errors of ``count`` frames, rotation vectors [rad] in sensor axes: white noise and a sine.
@@ -66,11 +66,13 @@ def star_errors(
     Raises:
         ValueError: no frame, or a number out of its range.
     """
-    _given.count_of("count", count)
-    _given.number("frame_s", frame_s, 0.0, above=True)
-    sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
-    size = _given.vector("low_frequency_rad", low_frequency_rad, 3, low=0.0)
-    period = _given.vector("low_frequency_period_s", low_frequency_period_s, 3, low=0.0, above=True)
+    _arguments.count_of("count", count)
+    _arguments.number("frame_s", frame_s, 0.0, above=True)
+    sigma = _arguments.vector("sigma_rad", sigma_rad, 3, low=0.0)
+    size = _arguments.vector("low_frequency_rad", low_frequency_rad, 3, low=0.0)
+    period = _arguments.vector(
+        "low_frequency_period_s", low_frequency_period_s, 3, low=0.0, above=True
+    )
     # Drawn by frame number, so that a longer run begins with the shorter one.
     root = jax.random.fold_in(key, _NOISE)
     keys = jax.vmap(lambda number: jax.random.fold_in(root, number))(jnp.arange(count))
@@ -82,7 +84,7 @@ def star_errors(
 
 
 def read_star(
-    q_ib: Float[Array, "4"], error: Float[Array, "3"], q_bs: _given.Listed | None = None
+    q_ib: Float[Array, "4"], error: Float[Array, "3"], q_bs: _arguments.Listed | None = None
 ) -> Float[Array, "4"]:
     """Measured q_ib: the true attitude after a small rotation about the sensor axes.
 
@@ -97,7 +99,7 @@ def read_star(
         ValueError: a q_bs of another shape.
     """
     if q_bs is not None:
-        error = rotate(normalise(_given.rows("q_bs", q_bs, 4)), error)
+        error = rotate(normalise(_arguments.rows("q_bs", q_bs, 4)), error)
     return normalise(multiply(q_ib, from_rotvec(error)))
 
 
@@ -146,17 +148,17 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
             bright enough.
     """
     half_turn = np.pi / 2.0
-    _given.number("field_rad", camera.field_rad, 0.0, half_turn - 2.0 * margin_rad, above=True)
-    _given.number("magnitude_limit", camera.magnitude_limit)
-    _given.number("sigma_rad", camera.sigma_rad, 0.0, 0.1, above=True)
-    _given.number("sigma_magnitude", camera.sigma_magnitude)
-    _given.number("sigma_growth", camera.sigma_growth, 0.0, 1.0)
-    _given.number("magnitude_sigma", camera.magnitude_sigma, 0.0)
-    _given.number("missed", camera.missed, 0.0, 1.0)
-    length = np.linalg.norm(_given.rows("q_bs", camera.q_bs, 4))
-    _given.number("q_bs must be a unit quaternion: its length", length, 0.999, 1.001)
-    _given.count_of("most_stars", camera.most_stars)
-    _given.number("false_stars", camera.false_stars, 0.0)
+    _arguments.number("field_rad", camera.field_rad, 0.0, half_turn - 2.0 * margin_rad, above=True)
+    _arguments.number("magnitude_limit", camera.magnitude_limit)
+    _arguments.number("sigma_rad", camera.sigma_rad, 0.0, 0.1, above=True)
+    _arguments.number("sigma_magnitude", camera.sigma_magnitude)
+    _arguments.number("sigma_growth", camera.sigma_growth, 0.0, 1.0)
+    _arguments.number("magnitude_sigma", camera.magnitude_sigma, 0.0)
+    _arguments.number("missed", camera.missed, 0.0, 1.0)
+    length = np.linalg.norm(_arguments.rows("q_bs", camera.q_bs, 4))
+    _arguments.number("q_bs must be a unit quaternion: its length", length, 0.999, 1.001)
+    _arguments.count_of("most_stars", camera.most_stars)
+    _arguments.number("false_stars", camera.false_stars, 0.0)
     bright = np.asarray(stars.magnitude) < camera.magnitude_limit
     if not np.any(bright):
         raise ValueError(
@@ -224,7 +226,7 @@ def photograph(
     index: StarIndex,
     q_ib: Float[Array, "4"],
     camera: StarCamera,
-    turn_rad: _given.Listed | None = None,
+    turn_rad: _arguments.Listed | None = None,
 ) -> StarImage:
     """Simulated image of a camera. Pure JAX: it maps over keys, attitudes and sizes of errors.
 
@@ -237,7 +239,7 @@ def photograph(
             `star_errors`: the image is taken at the attitude that `read_star` returns for it.
             None: no such error.
     """
-    q_is = multiply(q_ib, normalise(_given.rows("q_bs", camera.q_bs, 4)))
+    q_is = multiply(q_ib, normalise(_arguments.rows("q_bs", camera.q_bs, 4)))
     if turn_rad is not None:
         q_is = multiply(q_is, from_rotvec(jnp.asarray(turn_rad, float)))
     return expose(key, visible_stars(index, q_is, camera), camera)
@@ -251,7 +253,7 @@ def expose(key: Array, shown: StarField, camera: StarCamera) -> StarImage:
         shown: stars in the field, ``camera.most_stars`` rows from `visible_stars` or `turned`.
         camera: the camera.
     """
-    q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))
+    q_bs = normalise(_arguments.rows("q_bs", camera.q_bs, 4))
     rows = camera.most_stars + camera.false_stars
 
     normal = jax.random.normal(jax.random.fold_in(key, _NORMAL), (rows, 3))
@@ -292,9 +294,9 @@ def measure_attitude(
     index: StarIndex,
     q_ib: Float[Array, "4"],
     camera: StarCamera,
-    turn_rad: _given.Listed | None = None,
-    q_ib_prior: _given.Listed | None = None,
-    tolerance_rad: _given.Listed | None = None,
+    turn_rad: _arguments.Listed | None = None,
+    q_ib_prior: _arguments.Listed | None = None,
+    tolerance_rad: _arguments.Listed | None = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
     """A frame of a star sensor: photograph, identify the stars, QUEST. Pure JAX.
 
@@ -321,17 +323,19 @@ def solve(
     image: StarImage,
     index: StarIndex,
     camera: StarCamera,
-    q_ib_prior: _given.Listed | None = None,
-    tolerance_rad: _given.Listed | None = None,
+    q_ib_prior: _arguments.Listed | None = None,
+    tolerance_rad: _arguments.Listed | None = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
     """Attitude from an image of `expose`; other arguments and results as in `measure_attitude`."""
     star = image.star
     if q_ib_prior is not None:
-        boresight = rotate(normalise(_given.rows("q_bs", camera.q_bs, 4)), jnp.array([0.0, 0, 1.0]))
+        boresight = rotate(
+            normalise(_arguments.rows("q_bs", camera.q_bs, 4)), jnp.array([0.0, 0, 1.0])
+        )
         there = ~jnp.isnan(image.magnitude)
         if tolerance_rad is None:
             tolerance_rad = 6.0 * jnp.max(jnp.where(there, image.sigma_rad, 0.0))
-        prior = _given.rows("q_ib_prior", q_ib_prior, 4)
+        prior = _arguments.rows("q_ib_prior", q_ib_prior, 4)
         star = track_stars(index, image.vectors_b, prior, boresight, tolerance_rad)
     weight = jnp.where(star >= 0, 1.0 / image.sigma_rad**2, 0.0)
     found = quest(image.vectors_b, jnp.asarray(index.unit_i)[star], weight)
@@ -347,7 +351,7 @@ def _deflected(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[
 
 
 def observe_euler(
-    key: Array, q_nb: _given.Listed, sigma_rad: _given.Listed, present: _given.Listed
+    key: Array, q_nb: _arguments.Listed, sigma_rad: _arguments.Listed, present: _arguments.Listed
 ) -> Float[Array, "epochs 3"]:
     """Measured pitch, roll, heading [rad] of the body, each with white noise.
 
@@ -363,10 +367,10 @@ def observe_euler(
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.
     """
-    there = _given.presence(present)
+    there = _arguments.presence(present)
     count = len(there)
-    true = _given.rows("q_nb", q_nb, count, 4)
-    sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
+    true = _arguments.rows("q_nb", q_nb, count, 4)
+    sigma = _arguments.vector("sigma_rad", sigma_rad, 3, low=0.0)
     error = sigma[None] * jax.random.normal(key, (count, 3))
     roll, pitch, heading = to_euler(true)
     angles = pitch + error[:, 0], wrap(roll + error[:, 1]), wrap(heading + error[:, 2])

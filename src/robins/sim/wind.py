@@ -44,7 +44,7 @@ from robins import (
 )
 from robins.filters.belief import Number
 from robins.filters.values import Numbers
-from robins.sim import _given
+from robins.sim import _arguments
 from robins.sim.random import gauss_markov
 
 # Stream folded into the key; part of the file format, as `robins.sim.random.Component` is. The
@@ -93,16 +93,16 @@ def gusts(
         ValueError: no step, an end before the beginning, a duration of a gust that is not
             positive, speeds that are negative or not in order, a negative half width.
     """
-    _given.count_of("count", count)
-    _given.number("every_s", every_s, 0.0, above=True)
-    _given.number("begin_s", begin_s)
-    _given.number("end_s", end_s, endless=True)
-    _given.number("speed_m_s", speed_m_s, 0.0)
-    _given.number("direction_rad", direction_rad)
-    _given.number("half width of direction_rad", direction_rad[1], 0.0)
-    if _given.known(begin_s, end_s) and end_s < begin_s:
+    _arguments.count_of("count", count)
+    _arguments.number("every_s", every_s, 0.0, above=True)
+    _arguments.number("begin_s", begin_s)
+    _arguments.number("end_s", end_s, endless=True)
+    _arguments.number("speed_m_s", speed_m_s, 0.0)
+    _arguments.number("direction_rad", direction_rad)
+    _arguments.number("half width of direction_rad", direction_rad[1], 0.0)
+    if _arguments.known(begin_s, end_s) and end_s < begin_s:
         raise ValueError(f"gusts from begin_s = {begin_s} to end_s = {end_s}: the end comes first")
-    if _given.known(*speed_m_s) and speed_m_s[1] < speed_m_s[0]:
+    if _arguments.known(*speed_m_s) and speed_m_s[1] < speed_m_s[0]:
         raise ValueError(f"speed_m_s = {speed_m_s}: the least speed comes first")
     slowest, fastest = speed_m_s
     centre, half_width = direction_rad
@@ -119,7 +119,7 @@ def move_in_wind(
     wind: Numbers,
     step_s: Number,
     commanded_m_s: Number,
-    tau_s: _given.Listed,
+    tau_s: _arguments.Listed,
     start_m_s: Number,
 ) -> WindMotion:
     """Exact motion of a point mass in a piecewise constant wind.
@@ -136,11 +136,11 @@ def move_in_wind(
     """
     if np.ndim(wind) != 2 or len(wind) < 1:
         raise ValueError(f"wind must have shape (M, 2), M at least one, got {np.shape(wind)}")
-    wind = _given.rows("wind", wind, len(wind), 2)
-    commanded = _given.rows("commanded_m_s", commanded_m_s, 2)
-    start = _given.rows("start_m_s", start_m_s, 2)
-    _given.number("step_s", step_s, 0.0, above=True)
-    _given.number("tau_s", tau_s, 0.0, above=True)
+    wind = _arguments.rows("wind", wind, len(wind), 2)
+    commanded = _arguments.rows("commanded_m_s", commanded_m_s, 2)
+    start = _arguments.rows("start_m_s", start_m_s, 2)
+    _arguments.number("step_s", step_s, 0.0, above=True)
+    _arguments.number("tau_s", tau_s, 0.0, above=True)
     target = wind + commanded[None]
 
     def step(state, towards):
@@ -183,7 +183,7 @@ def wind_at(wind: Numbers, step_s: Number, time_s: Number) -> Array:
     Raises:
         ValueError: a step that is not positive, or a time before zero.
     """
-    _given.number("step_s", step_s, 0.0, above=True)
+    _arguments.number("step_s", step_s, 0.0, above=True)
     at, _ = _step_of(time_s, step_s, len(wind))
     return jnp.asarray(wind, float)[at]
 
@@ -196,8 +196,8 @@ def _after(velocity, displacement, towards, time, tau):
 
 
 def _step_of(time_s: Number, step_s: Number, count: int) -> tuple[Array, Array]:
-    """Number of the step that contains an instant, and the time since its beginning."""
-    _given.number("time_s", time_s, 0.0)
+    """Index of the step that contains an instant, and the time since its start."""
+    _arguments.number("time_s", time_s, 0.0)
     time = jnp.asarray(time_s, float)
     number = jnp.clip(jnp.floor(time / step_s + _ROUNDING), 0, count - 1)
     return jnp.asarray(number, int), time - number * step_s
@@ -220,8 +220,8 @@ def dryden(
     count: int,
     step_s: Number,
     airspeed_m_s: Number,
-    sigma_m_s: _given.Listed,
-    length_m: _given.Listed = DRYDEN_LENGTH_M,
+    sigma_m_s: _arguments.Listed,
+    length_m: _arguments.Listed = DRYDEN_LENGTH_M,
     direction_rad: Number = 0.0,
 ) -> Float[Array, "{count} 2"]:
     """Dryden turbulence (count, 2) [m/s] at 0, step, 2 step ..., in its steady state throughout.
@@ -242,8 +242,8 @@ def dryden(
         ValueError: no sample, a negative sigma, or a step, airspeed or length not positive.
     """
     _check(count, step_s, airspeed_m_s, direction_rad)
-    sigma = _given.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
-    tau = _given.vector("length_m", length_m, 2, low=0.0, above=True) / airspeed_m_s
+    sigma = _arguments.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
+    tau = _arguments.vector("length_m", length_m, 2, low=0.0, above=True) / airspeed_m_s
     along = gauss_markov(jax.random.fold_in(key, _ALONG), count, 1, step_s, tau[0])[:, 0]
     across = _across(jax.random.fold_in(key, _ACROSS), count, step_s / tau[1])
     return _rotated(sigma[None] * jnp.stack([along, across], 1), direction_rad)
@@ -254,8 +254,8 @@ def von_karman(
     count: int,
     step_s: Number,
     airspeed_m_s: Number,
-    sigma_m_s: _given.Listed,
-    length_m: _given.Listed = VON_KARMAN_LENGTH_M,
+    sigma_m_s: _arguments.Listed,
+    length_m: _arguments.Listed = VON_KARMAN_LENGTH_M,
     direction_rad: Number = 0.0,
 ) -> Float[Array, "{count} 2"]:
     """Von Karman turbulence [m/s] at 0, step, 2 step ...; arguments are those of `dryden`.
@@ -270,14 +270,14 @@ def von_karman(
         ValueError: as `dryden`; a step, airspeed or length that is traced; or a step so short
             that two samples differ by rounding only.
     """
-    if not _given.known(step_s, airspeed_m_s, length_m):
+    if not _arguments.known(step_s, airspeed_m_s, length_m):
         raise ValueError(
             "step_s, airspeed_m_s and length_m of von Karman turbulence must be plain numbers, "
             "not traced: its spectrum is found before the run is compiled"
         )
     _check(count, step_s, airspeed_m_s, direction_rad)
-    sigma = _given.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
-    _given.vector("length_m", length_m, 2, low=0.0, above=True)
+    sigma = _arguments.vector("sigma_m_s", sigma_m_s, 2, low=0.0)
+    _arguments.vector("length_m", length_m, 2, low=0.0, above=True)
     steps = np.broadcast_to(
         float(step_s) * float(airspeed_m_s) / (_A * np.asarray(length_m, float)), (2,)
     )
@@ -293,10 +293,10 @@ def von_karman(
 
 
 def _check(count, step_s, airspeed_m_s, direction_rad):
-    _given.count_of("count", count)
-    _given.number("step_s", step_s, 0.0, above=True)
-    _given.number("airspeed_m_s", airspeed_m_s, 0.0, above=True)
-    _given.number("direction_rad", direction_rad)
+    _arguments.count_of("count", count)
+    _arguments.number("step_s", step_s, 0.0, above=True)
+    _arguments.number("airspeed_m_s", airspeed_m_s, 0.0, above=True)
+    _arguments.number("direction_rad", direction_rad)
 
 
 def _rotated(pair, direction_rad):

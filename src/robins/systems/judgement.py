@@ -296,7 +296,7 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
         "sigma": Claim(
             texts["sigma"],
             needs,
-            lambda metrics: float(np.max([_proven(m) for m in of(metrics)])),
+            lambda metrics: float(np.max([_largest_deviation(m) for m in of(metrics)])),
             (0.0, 0.05),
             tested=True,
         ),
@@ -317,7 +317,7 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
     }
 
 
-def _proven(metrics: Mapping[str, Any]) -> float:
+def _largest_deviation(metrics: Mapping[str, Any]) -> float:
     """Largest significant deviation from one of the ratio of RMS error to sigma, over the states.
 
     The ratio scatters by 10 % in 50 runs, so its confidence bound nearer to one is compared.

@@ -19,8 +19,8 @@ from robins.filters.belief import Number
 from robins.filters.values import Numbers
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
-from robins.sim import _given
-from robins.sim._given import Listed
+from robins.sim import _arguments
+from robins.sim._arguments import Listed
 from robins.sim.commands import (
     Manoeuvre,
     accelerate,
@@ -93,12 +93,12 @@ def during(spans: Sequence[Span | None], time_s: np.ndarray) -> np.ndarray:
 
 def as_array(numbers: PyTree) -> Numbers:
     """Numbers of parameters as a NumPy array, which can be checked, or a JAX array if traced."""
-    return (np if _given.known(numbers) else jnp).asarray(numbers, float)
+    return (np if _arguments.known(numbers) else jnp).asarray(numbers, float)
 
 
 def may_be_nonzero(numbers: Sequence[Number]) -> bool:
     """True if any size is nonzero, or is traced and so may be nonzero."""
-    return not _given.known(numbers) or any(numbers)
+    return not _arguments.known(numbers) or any(numbers)
 
 
 Draw = Literal["normal", "plus-sigma", "random-sign"]
@@ -106,7 +106,7 @@ Draw = Literal["normal", "plus-sigma", "random-sign"]
 
 
 def signed(key: Array, size: Listed, draw: Draw) -> Array:
-    """Errors of a stated size, drawn as `draw` says; shape of `size`."""
+    """Errors of a stated size, drawn according to `draw`; shape of `size`."""
     sigma = jnp.asarray(size, float)
     normal = jax.random.normal(key, sigma.shape)
     if draw == "plus-sigma":

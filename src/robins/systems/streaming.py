@@ -79,7 +79,7 @@ class MeasurementOutcome(NamedTuple):
     dof: int  # components that were measured
 
 
-def watched(step: Step, vector: jax.Array) -> WatchedStep:
+def with_outcomes(step: Step, vector: jax.Array) -> WatchedStep:
     """A vector, then outcomes of the sensors (see `outcomes_of`); the updates count for doubts."""
     last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
     seen = [
@@ -95,7 +95,7 @@ def outcomes_of(
     """Outcome of each sensor, and probability that each suspect of a bank is at fault.
 
     Args:
-        rest: what `watched` adds to its vector.
+        rest: what `with_outcomes` adds to its vector.
         sensors: of the step, sorted.
         suspects: of the filter; those without a probability are left out.
     """
@@ -281,7 +281,7 @@ class Live:
         """States of the filter, the present one last; empty before the start."""
         return [] if self._online is None else [self._online.state]
 
-    def _go_on_from(self, states: list[PyTree]) -> None:
+    def _resume_from(self, states: list[PyTree]) -> None:
         """Set the states of the filter, as given by `_known_states`."""
         self._online = self._on(states[-1])
 
@@ -291,7 +291,7 @@ class Live:
         Raises:
             ResultError: it cannot be written; the message gives the reason.
         """
-        snapshot.write(path, type(self).__name__, *self._all_known())
+        snapshot.write(path, type(self).__name__, *self._saved_state())
 
     @classmethod
     def load(cls: type[LiveT], path: str | os.PathLike[str]) -> LiveT:
@@ -302,7 +302,7 @@ class Live:
         """
         found = snapshot.read(path, cls.__name__)
         try:
-            return _made_again(cls, found.parameters, found.state)
+            return _rebuilt(cls, found.parameters, found.state)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             what = f"it does not hold what a {cls.__name__} of this robins keeps ({error})"
             fix = "use the robins that wrote it, or start without it"
@@ -310,13 +310,13 @@ class Live:
 
     def __reduce__(self) -> tuple:
         """Pickle the saved state; compiled code is compiled again on loading."""
-        return _made_again, (type(self), *self._all_known())
+        return _rebuilt, (type(self), *self._saved_state())
 
     def __copy__(self: LiveT) -> LiveT:
         """Deep copy, independent of the original."""
         return deepcopy(self)
 
-    def _all_known(self) -> tuple[str, dict[str, Any]]:
+    def _saved_state(self) -> tuple[str, dict[str, Any]]:
         """Parameters as TOML, and the rest of the state."""
         leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(self._known_states())]
         state = {
@@ -329,8 +329,8 @@ class Live:
         return text_of(self.parameters.model_dump(exclude_none=True)), state
 
 
-def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> LiveT:
-    """Rebuild an object from its parameters (TOML) and state, as of `_all_known`."""
+def _rebuilt(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> LiveT:
+    """Rebuild an object from its parameters (TOML) and state, as of `_saved_state`."""
     given = cls._parameters.model_validate(mapping_of(parameters), strict=False)
     made = cls(given, **state["made_with"])
     _compare(cls.__name__, cls._kept, state["own"])
@@ -339,11 +339,11 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
     for name, value in state["own"].items():
         setattr(made, name, value)
     for name, part in state["parts"].items():
-        _go_on(getattr(made, name), part)
+        _restore(getattr(made, name), part)
     if (leaves := state["filter"]) is not None:
         each = len(jax.tree_util.tree_leaves(made._compiled_state))
         pieces = [leaves[k : k + each] for k in range(0, len(leaves), each)]
-        made._go_on_from([restored(made._compiled_state, piece) for piece in pieces])
+        made._resume_from([restored(made._compiled_state, piece) for piece in pieces])
     return made
 
 
@@ -362,12 +362,12 @@ def _compare(what: str, own: Iterable[str], known: Iterable[str]) -> None:
         raise ValueError(f"{what} differs in {', '.join(differ)}")
 
 
-def _go_on(part: Part, known: Mapping[str, Any]) -> None:
+def _restore(part: Part, known: Mapping[str, Any]) -> None:
     """Set the attributes found by `_state_of`."""
     _compare(type(part).__name__, _state_of(part), known)
     for name, value in known.items():
         if _is_part(getattr(part, name)):
-            _go_on(getattr(part, name), value)
+            _restore(getattr(part, name), value)
         else:
             setattr(part, name, value)
 

@@ -95,7 +95,7 @@ def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
 
 
 def expected(fitted: AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Allan deviation (T, axes) of each fitted term by itself, as in IEEE Std 952, Annex C."""
+    """Allan deviation (T, axes) of each fitted term alone, as in IEEE Std 952, Annex C."""
     tau = tau_s[:, None]
     shape = {
         "Q": np.sqrt(3.0) / tau,

@@ -73,7 +73,9 @@ def solution_of(problem: DesignProblem, found: TradeOff) -> xr.Dataset:
     gamma = variable("gamma", np.array(found.gammas), gain, "bound on the H-infinity norm")
     return xr.Dataset(
         array("trade_off_h2", numbers("h2"), unit=z)
-        | array("trade_off_hinf", numbers("hinf"), unit=gain, least=least, least_of=_whose(found))
+        | array(
+            "trade_off_hinf", numbers("hinf"), unit=gain, least=least, least_of=_gain_set(found)
+        )
         | array("trade_off_bound", numbers("bound"), unit=z)
         | array("kalman_h2", found.kalman.h2, unit=z)
         | array("kalman_hinf", found.kalman.hinf, unit=gain),
@@ -91,7 +93,7 @@ def gains_of(problem: DesignProblem, found: TradeOff) -> dict[str, Any]:
         "form": problem.form,
         "blocks": problem.blocks,
         "least_gamma": found.least.reached,
-        "least_gamma_of": _whose(found),
+        "least_gamma_of": _gain_set(found),
         "least_gamma_proved": found.least.proved,
         "least_gamma_step": found.least.step,
         "designs": [_design_row(name, design) for name, design in made],
@@ -126,7 +128,7 @@ def advice(problem: DesignProblem, found: TradeOff) -> list[str]:
     """Conclusions from the numbers, in sentences."""
     own, gain = found.kalman, _unit(problem.unit_gain)
     least = found.least
-    reach = f"the least Hinf of {_whose(found)} is {least.reached:.4g}{gain}"
+    reach = f"the least Hinf of {_gain_set(found)} is {least.reached:.4g}{gain}"
     if least.reached == 0.0:
         reach = "no Hinf is too small to be reached"
     elif least.exact:
@@ -158,7 +160,7 @@ def advice(problem: DesignProblem, found: TradeOff) -> list[str]:
     return notes
 
 
-def _whose(found: TradeOff) -> str:
+def _gain_set(found: TradeOff) -> str:
     """Set of gains that the least gamma refers to."""
     return "any gain" if found.least.exact or found.least.reached == 0.0 else "the gains found"
 

@@ -199,7 +199,7 @@ def _tum(solution: xr.Dataset, name: str) -> dict[str, bytes]:
         q_nb = attitude.sel(filter=one).values
         place, q, note = np.zeros((len(q_nb), 3)), q_nb, "zero: no place was found"
         if origin is not None and one in ways:
-            place, q = _about(origin, ways[one], q_nb)
+            place, q = _local_frame(origin, ways[one], q_nb)
             lat, lon, alt = *np.degrees(origin[:2]), origin[2]
             note = f"{ways[one].text}, m east, north, up of"
             note += f" {lat:.9f} deg, {lon:.9f} deg, {alt:.4f} m (WGS-84)"
@@ -220,7 +220,7 @@ def _tum(solution: xr.Dataset, name: str) -> dict[str, bytes]:
     return found
 
 
-def _about(
+def _local_frame(
     origin: tuple[float, float, float], track: ExportTrack, q_nb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places (E, 3) [m] east, north, up of an origin, and q_nb (E, 4) with the axes of NED there.

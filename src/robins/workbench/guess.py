@@ -77,13 +77,13 @@ def guess(path: Log) -> str:
             mend = "give it to the commands as it is; no columns are needed."
             raise InputError(f"is a recording whose format is known: {row.about}", start.file, mend)
     head = head_of(path)
-    names, separator, decimal, cells = _sheet(head)
+    names, separator, decimal, cells = _read_cells(head)
     found, aside = _known(names)
     if "time" not in found and (clock := _unnamed_clock(names, cells, decimal, aside)):
         found["time"] = clock
         del aside[clock[0]]
     used = _whole(set(found))
-    aside |= {found[q][0]: _lack(q, set(found)) for q in set(found) - used - {"time"}}
+    aside |= {found[q][0]: _missing_column(q, set(found)) for q in set(found) - used - {"time"}}
     columns = {q: found[q] for q in QUANTITIES if q in used | {"time"} and q in found}
     sizes = dict(zip(head.names, map(len, head.arrays), strict=True))
     others = [name for name in sizes if name not in names]
@@ -91,14 +91,14 @@ def guess(path: Log) -> str:
     if not used:
         held = ", ".join([*names, *others][:30])
         mend = 'write the columns yourself, as "A format of your own" of docs/logs.md shows.'
-        lacks = {_lack(q, set(found)) for q in set(found) - {"time"}}
+        lacks = {_missing_column(q, set(found)) for q in set(found) - {"time"}}
         what = "; ".join(["no sensor has all its headings", *sorted(lacks), f"there are {held}"])
         raise InputError(what, os.fspath(path), mend)
     texts = {q: [row[names.index(name)] for row in cells] for q, (name, _, _) in columns.items()}
     numbers = {q: np.array([_number(text, decimal) for text in texts[q]]) for q in columns}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns without a number
-        _fill(columns, numbers, texts.get("time", []))
+        _fill_in_units(columns, numbers, texts.get("time", []))
         settings, notes = _settings(separator, decimal, numbers, columns)
         _prove_gyros(path, settings, columns, numbers)
     taken = {name for name, _, _ in columns.values()}
@@ -121,7 +121,7 @@ def _whole(found: set[str]) -> set[str]:
     return {q for group in groups & keep for q in parts(group)}
 
 
-def _lack(quantity: str, found: set[str]) -> str:
+def _missing_column(quantity: str, found: set[str]) -> str:
     """Reason why a quantity is left out: what its table lacks."""
     group = next(name for name in GROUPS if quantity in parts(name))
     needed = {"gyro": "gyro accel", "accel": "accel gyro", "velocity": "velocity place"}
@@ -136,7 +136,7 @@ def _lack(quantity: str, found: set[str]) -> str:
 # ------------------------------------------------------------------------------------ headings
 
 
-def _sheet(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
+def _read_cells(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
     """Names, separator, decimal mark and cells of the first rows.
 
     Raises:
@@ -287,7 +287,7 @@ def _number(text: str, decimal: str) -> float:
         return np.nan
 
 
-def _fill(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str]) -> None:
+def _fill_in_units(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str]) -> None:
     """Fill in units that follow from the numbers."""
     if "time" in columns and not columns["time"][1]:
         name, _, doubt = columns["time"]
@@ -379,7 +379,7 @@ def _prove_gyros(
         others = [table for table in tables if table is not imu]
         scale, trust = _turned_by_gravity(imu)
         fitting = [u for u in (*KINDS["angle rate"], *_MILLI) if abs(scale / _si(u) - 1.0) < 0.15]
-        sound = [u for u in ("rad/s", "deg/s") if not _objects(imu, others, _si(u))]
+        sound = [u for u in ("rad/s", "deg/s") if not _doctor_objects(imu, others, _si(u))]
         if trust and fitting:
             unit, why = (
                 fitting[0],
@@ -426,7 +426,7 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
     return float(a @ b) / energy, alike > 0.9
 
 
-def _objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
+def _doctor_objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
     """True if the doctor objects to the unit of the rates, multiplied by this scale."""
     found = logs.examine([replace(imu, gyro=imu.gyro * scale), *others])
     return any(finding.code == "gyro_unit" for finding in found)

@@ -152,7 +152,7 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
 
 
 def with_default_filter(one: Simulated) -> tuple[str, ...]:
-    """Filters of a scenario and, where the study has it, the default of the system."""
+    """Filters of a scenario, and the default filter of the system if the study has one."""
     return (*one.own, *(name for name in (one.system.default,) if name in one.study.filters))
 
 

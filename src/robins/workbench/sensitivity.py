@@ -21,11 +21,11 @@ from robins import _float64
 from robins.campaign.sensitivity import (
     SensitivityRuns,
     between,
-    course_differs,
-    follows,
+    changes_belief,
+    courses_differ,
     indices,
+    interpolated,
     labelled,
-    one_at,
     simulate_points,
     sobol_points,
     untraceable,
@@ -162,7 +162,7 @@ def _budget(
         with refusing(f"--vary {one.key}"):
             ranges.append(between(low, high))
             laid = [study.lay_out(end) for end in (low, high)]
-        if any(course_differs(course, again, end) for end in laid):
+        if any(courses_differ(course, again, end) for end in laid):
             raise InputError(
                 "decides the motion or what else all runs share, so it cannot vary with the rest "
                 "of the world",
@@ -179,7 +179,7 @@ def _simulated(
     runs: int,
     progress: Progress,
 ) -> tuple[np.ndarray, list[bool], list[str]]:
-    """Squared errors (d + 2, samples, runs, s), flags of `follows`, parts that JAX computed."""
+    """Squared errors (d + 2, samples, runs, s), `changes_belief`, and parts that JAX computed."""
     count = points.shape[0] * points.shape[1]
 
     def done(share: float) -> None:
@@ -192,7 +192,7 @@ def _simulated(
     except jax.errors.JAXTypeError as error:
         raise _refused(budget, every) from error
     squares = found.reshape(*points.shape[:2], *found.shape[1:])
-    return squares, follows(believed.reshape(*points.shape[:2], runs)), jax_parts
+    return squares, changes_belief(believed.reshape(*points.shape[:2], runs)), jax_parts
 
 
 def _outcome(
@@ -206,7 +206,7 @@ def _outcome(
     laws = [one.law for one in budget.ranges]
     shares = points[:2].reshape(-1, len(every)).T
     drawn = [
-        one_at(share, one.low, one.high, range_.by_logarithm)
+        interpolated(share, one.low, one.high, range_.by_logarithm)
         for one, range_, share in zip(every, budget.ranges, shares, strict=True)
     ]
     return Outcome(

@@ -20,7 +20,7 @@ from robins import scenario
 from robins.campaign.machine import one_by_one
 from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import Blocks, blocks_of, one_record
-from robins.campaign.sensitivity import course_differs
+from robins.campaign.sensitivity import courses_differ
 from robins.campaign.tuning import Data, Objective, Tree, Trial, UndeterminedError
 from robins.filters import Filter, run
 from robins.filters.analysis.predictive import predicted, scored
@@ -49,7 +49,7 @@ class TunedParameter(NamedTuple):
         return scenario.setting(self.key, scenario.scaled(self.key, self.start, factor))
 
 
-def varied(texts: Sequence[str], parameters: Any, text: str) -> list[TunedParameter]:
+def tuned_parameters(texts: Sequence[str], parameters: Any, text: str) -> list[TunedParameter]:
     """Read texts ``key`` or ``key=value``.
 
     Raises:
@@ -124,7 +124,9 @@ def on_runs(
     read = read_scenario(name, settings)
     wanted = filter_name or read.own[0]
     (chosen,) = check_filters(read.source, read.study.filters, [wanted])
-    tuned = varied(vary, read.parameters, scenario.text_of(overridden(read.text, settings)))
+    tuned = tuned_parameters(
+        vary, read.parameters, scenario.text_of(overridden(read.text, settings))
+    )
     problem = read.problem((chosen,), seed)
     names = [b.name for b in problem.blocks]
     by = by or ERROR
@@ -142,7 +144,7 @@ def on_runs(
     ends = [parsed(settings_at(tuned, x)) for x in np.outer((0.0, 1.0), np.ones(len(tuned)))]
     course = lay_out(ends[0])
     # a filter's assumptions on the course, such as its process noise, are its inputs
-    moves = course_differs(course, *map(lay_out, ends))
+    moves = courses_differ(course, *map(lay_out, ends))
 
     def trial(x: np.ndarray) -> Trial:
         given = parsed(settings_at(tuned, x))
@@ -230,7 +232,9 @@ def on_log(
         raise InputError("a log has no truth", f"--by {by}", f"leave it out, or say {INNOVATIONS}.")
     wanted = filter_name or opened.parameters.filters[0]
     (chosen,) = check_filters(system.name, system.replay_filters, [wanted])
-    tuned = varied(vary, opened.parameters, scenario.text_of(overridden(opened.text, settings)))
+    tuned = tuned_parameters(
+        vary, opened.parameters, scenario.text_of(overridden(opened.text, settings))
+    )
     dataset = opened.read(findings)
 
     def parsed(more: Sequence[str]) -> Any:

@@ -223,7 +223,7 @@ class ArduPilotPhysics(Closing):
             arrived = self._waiting.popleft() if self._waiting else self._take(left)
             if arrived is None:
                 return None
-            if (servos := self._sort(*arrived)) is not None:
+            if (servos := self._classify(*arrived)) is not None:
                 return servos
 
     def reply(self, state: BodyState) -> None:
@@ -255,7 +255,7 @@ class ArduPilotPhysics(Closing):
         except BridgeError:
             return False
 
-    def _sort(self, datagram: bytes, sender: Address) -> Servos | None:
+    def _classify(self, datagram: bytes, sender: Address) -> Servos | None:
         """Packet that requests a step; None: it was not one, or its answer was repeated."""
         try:
             servos = decode(datagram)

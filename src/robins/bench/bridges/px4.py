@@ -225,9 +225,9 @@ class Px4Simulator(Closing):
         except BridgeError:
             self.counts.bad += 1
         for one in found:
-            self._sort(one)
+            self._classify(one)
 
-    def _sort(self, one: Any) -> None:
+    def _classify(self, one: Any) -> None:
         kind = one.get_type()
         if kind == "HIL_ACTUATOR_CONTROLS":
             self.counts.actuators += 1

@@ -51,7 +51,7 @@ class _Fault(NamedTuple):
     type: int | None  # of the message
     is_: LinkFault
 
-    def meets(self, link: str, direction: str, kind: int, now_ns: int) -> bool:
+    def applies_to(self, link: str, direction: str, kind: int, now_ns: int) -> bool:
         return (
             self.begin_ns <= now_ns < self.end_ns
             and self.is_.link in (None, link)
@@ -147,7 +147,7 @@ class Injector:
         if kind < FIRST_DATA:
             return [LineOutput(None, frame)]
         where = link, direction
-        met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
+        met = [one for one in self._faults if one.applies_to(link, direction, kind, now_ns)]
         if met or kind in self._repeated:
             payload = self._faulty_payload(where, kind, frame.payload, met, now_ns)
             if payload is not frame.payload:
@@ -158,7 +158,7 @@ class Injector:
             if pieces and one.is_.kind not in self._table.device_faults:
                 pieces = self._damaged(where, kind, one, pieces, raw, now_ns)
         if pieces and where in self._held:
-            pieces += self._overtaken(where, kind)
+            pieces += self._reordered(where, kind)
         return pieces
 
     def release(self, link: str, direction: Direction, now_ns: int) -> list[LineOutput]:
@@ -262,7 +262,7 @@ class Injector:
             held += [_HeldFrame(one.end_ns, piece, kind, one.number) for piece in pieces]
         return []  # held, or lost
 
-    def _overtaken(self, where: tuple[str, str], kind: int) -> list[LineOutput]:
+    def _reordered(self, where: tuple[str, str], kind: int) -> list[LineOutput]:
         """Reordered frames that waited for a frame of this type."""
         held = self._held[where]
         out = [one.piece for one in held if one.fault is not None and one.type == kind]

@@ -125,7 +125,7 @@ class Hub:
         """Add a page."""
         client.greet(*self._greeting())
         self.clients.add(client)
-        self.beat()
+        self.heartbeat()
 
     def leave(self, client: Client) -> None:
         """Remove a page."""
@@ -136,16 +136,16 @@ class Hub:
         self.events.acknowledge(alarms)
         self._send_all({"kind": "acknowledged", "alarms": alarms})
 
-    def beat(self) -> None:
+    def heartbeat(self) -> None:
         """Send each page a heartbeat with the counts of dropped samples."""
         for client in self.clients:
-            beat = {
+            heartbeat = {
                 "kind": "beat",
                 "dropped": client.dropped,
                 "dropped_before": self._dropped,
                 "pages": len(self.clients),
             }
-            client.latest("beat", to_json(beat))
+            client.latest("beat", to_json(heartbeat))
 
     def end(self) -> None:
         """Notify each page that the bench is gone."""

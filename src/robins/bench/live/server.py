@@ -48,7 +48,7 @@ def application(hub: Hub, pass_on: Pass) -> Starlette:
     async def page(_: Request) -> FileResponse:
         return FileResponse(STATIC / "index.html")
 
-    async def talk(websocket: WebSocket) -> None:
+    async def live_socket(websocket: WebSocket) -> None:
         await websocket.accept()
         client = Client()
         hub.join(client)
@@ -65,7 +65,7 @@ def application(hub: Hub, pass_on: Pass) -> Starlette:
 
     routes = [
         Route("/", page),
-        WebSocketRoute("/live", talk),
+        WebSocketRoute("/live", live_socket),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     return Starlette(routes=routes, middleware=[Middleware(Guard)])
@@ -122,12 +122,15 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
             timeout_graceful_shutdown=1,
         )
     )
-    tasks = [asyncio.create_task(server.serve(sockets=[at])), asyncio.create_task(_beat(hub))]
+    tasks = [asyncio.create_task(server.serve(sockets=[at])), asyncio.create_task(_heartbeat(hub))]
     if reader is not None and writer is not None:
         while not server.started and not tasks[0].done():
             await asyncio.sleep(0.01)
         writer.write(to_json({"listens": True}).encode() + b"\n")
-        tasks += [asyncio.create_task(_feed(reader, hub)), asyncio.create_task(_watch_parent())]
+        tasks += [
+            asyncio.create_task(_receive_frames(reader, hub)),
+            asyncio.create_task(_watch_parent()),
+        ]
     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks[1:]:
         task.cancel()
@@ -137,7 +140,7 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
     await tasks[0]
 
 
-async def _feed(reader: asyncio.StreamReader, hub: Hub) -> None:
+async def _receive_frames(reader: asyncio.StreamReader, hub: Hub) -> None:
     """Take in the data of the bench until it is gone."""
     with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
         while True:
@@ -145,9 +148,9 @@ async def _feed(reader: asyncio.StreamReader, hub: Hub) -> None:
             hub.take(kind, await reader.readexactly(length))
 
 
-async def _beat(hub: Hub) -> None:
+async def _heartbeat(hub: Hub) -> None:
     while True:
-        hub.beat()
+        hub.heartbeat()
         await asyncio.sleep(BEAT_S)
 
 

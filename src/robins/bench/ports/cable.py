@@ -35,7 +35,7 @@ def cable() -> Iterator[Cable]:
         wake, woken = os.pipe()
         for end in (wake, woken):
             stack.callback(os.close, end)
-        carrier = threading.Thread(target=_carry, args=(one, other, wake), daemon=True)
+        carrier = threading.Thread(target=_copy_both_ways, args=(one, other, wake), daemon=True)
         carrier.start()
         try:
             yield Cable(one.path, other.path)
@@ -44,7 +44,7 @@ def cable() -> Iterator[Cable]:
             carrier.join()
 
 
-def _carry(one: Pair, other: Pair, wake: int) -> None:
+def _copy_both_ways(one: Pair, other: Pair, wake: int) -> None:
     """Copy both ways until woken."""
     across = {one.master: other.master, other.master: one.master}
     waiting = dict.fromkeys(across, b"")  # bytes to write, by end

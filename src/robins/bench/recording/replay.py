@@ -162,7 +162,7 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
     Raises:
         ReplayError: there is no begin; raised at the end.
     """
-    begin, life, ticked = None, -1, False
+    begin, life, record_tick = None, -1, False
     links: set[str] = set()
     to, back = Receiver(), Receiver()
     for entry in entries:
@@ -172,15 +172,15 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
         if entry.direction == "to":
             found = to.feed(entry.data)
             new = next((f for f in found if f.header.type == _BEGIN), None)
-            if new is not None and (begin is None or ticked):
-                begin, life, ticked, back = new, life + 1, False, Receiver()
+            if new is not None and (begin is None or record_tick):
+                begin, life, record_tick, back = new, life + 1, False, Receiver()
         elif begin is None:
             continue
         else:
             found = back.feed(entry.data)
         if begin is not None:
             row = _LinkRow(life, begin, entry.direction == "to", entry.data, found)
-            ticked = ticked or (row.to and bool(row.ticks()))
+            record_tick = record_tick or (row.to and bool(row.ticks()))
             yield row
     if begin is None:
         there = ", ".join(sorted(links)) or "none"
@@ -217,7 +217,7 @@ class _Replay:
             last = row.found[-1].header if row.found else last
             for tick in row.ticks():
                 step = int(BARE.decode("tick", tick.payload)["step"])
-                self._life.ticked(step)
+                self._life.record_tick(step)
                 if step >= latest:  # a part does not keep its answers to older ones
                     self._where = f"in step {step}"
                     for frame in self._until_done(step, latest):
@@ -337,7 +337,7 @@ class _PartLifetime:
     def run(self) -> int:
         return self.begin.header.run
 
-    def ticked(self, step: int) -> None:
+    def record_tick(self, step: int) -> None:
         """Record a tick that was sent to the part."""
         self._tick = step
 

@@ -103,12 +103,12 @@ class Session:
             BenchError: the rig cannot prepare the run.
         """
         self.flight, self.rig, self._watch = flight, flight.rig, watch
-        self._tell = progress or (lambda share, what: None)
+        self._report_progress = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
         self.ports, programs = replacements(setup.ports)
         if config is None:
-            self._tell(0.0, "preparing")
+            self._report_progress(0.0, "preparing")
             config = config_of(flight)
         self.config = config
         self.telemetry = Telemetry(self.rig, self.steps, config.step_ns, record)
@@ -214,7 +214,7 @@ class Session:
                 if (now := time.monotonic()) - told > _TELL_S:
                     self.pace, counted, since = counted / max(now - since, 1e-9), 0, now
                     told = now
-                    self._tell((k + 1) / self.steps, f"{self.time_s:.0f} s of the run")
+                    self._report_progress((k + 1) / self.steps, f"{self.time_s:.0f} s of the run")
         self._catch_up()
         return self.steps
 
@@ -345,7 +345,7 @@ class Session:
         silent = [part for part in parts if part in self.ports]
         words = [f"{', '.join(processes)}: starting, compiling"] * bool(processes)
         words += [f"{', '.join(silent)}: no hello from the port yet"] * bool(silent)
-        self._tell(self.done / self.steps, "; ".join(words))
+        self._report_progress(self.done / self.steps, "; ".join(words))
         if since_s > _LONG_S:
             self.event("waiting", f"after {since_s:.0f} s: {'; '.join(words)}")
 

@@ -102,7 +102,7 @@ class PageObserver:
             return []
         self._page.poll()
         if session.paused:
-            self._tell(session, session.done)
+            self._report_state(session, session.done)
         return self._page.commands()
 
     def step(self, session: Session, step: int) -> None:
@@ -121,12 +121,12 @@ class PageObserver:
                 values = view.sample(series, session.config, self._since, step)
                 self._page.push(session.time_s, [*values, session.step_ms])
                 self._since = step + 1
-        self._tell(session, step + 1)
+        self._report_state(session, step + 1)
 
     def _state(self, session: Session, done: int) -> JsonObject:
         return state(session, done) | {"fault_spans": self._spans.for_page}
 
-    def _tell(self, session: Session, done: int) -> None:
+    def _report_state(self, session: Session, done: int) -> None:
         now = time.monotonic()
         if self._page is not None and now - self._told >= _STATUS_S:
             self._told = now

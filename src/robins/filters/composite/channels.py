@@ -133,7 +133,7 @@ class JoinedFilter(Composite):
         fuse: ``beliefs -> Belief`` of all members.
         apart: ``(beliefs, i) -> bool``, true if local filter i contradicts another.
         first_shares: ``belief -> shares`` at the start.
-        parted: ``(belief, shares) -> beliefs`` of the members.
+        divided: ``(belief, shares) -> beliefs`` of the members.
         moved: ``(state, motion, u) -> JoinedPrediction``.
     """
 
@@ -149,8 +149,8 @@ class JoinedFilter(Composite):
     def first_shares(self, belief: Belief) -> Array:
         raise NotImplementedError(f"{type(self).__name__} must have `first_shares`")
 
-    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
-        raise NotImplementedError(f"{type(self).__name__} must have `parted`")
+    def divided(self, belief: Belief, shares: Array) -> list[Belief]:
+        raise NotImplementedError(f"{type(self).__name__} must have `divided`")
 
     def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
         raise NotImplementedError(f"{type(self).__name__} must have `moved`")
@@ -170,7 +170,7 @@ class JoinedFilter(Composite):
         given = local_dims(self.channels, dims)
         given += [{}] * (len(self.filters) - len(given))
         shares = self.first_shares(belief)
-        each = zip(self.filters, self.parted(belief, shares), given, strict=True)
+        each = zip(self.filters, self.divided(belief, shares), given, strict=True)
         members = tuple(f.init(own, d) for f, own, d in each)
         silent, singular = (jnp.zeros(len(x), int) for x in (self.channels, members))
         return FilterState(belief, JoinedMemory(members, shares, silent, singular))
@@ -186,7 +186,7 @@ class JoinedFilter(Composite):
         return tuple(member.belief for member in joined.members), follow
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
+        return self.members(state)[1](self.divided(belief, state.memory.shares), belief)
 
     def predict_separately(
         self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Data, shares: Array

@@ -115,7 +115,7 @@ class Delayed(FilterWrapper):
             before=repeated(inner, size),
             moved=jnp.zeros(size, bool),
             u=repeated(on_device(self.u), size),
-            y={s.name: repeated(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
+            y={s.name: repeated(_no_reading(s, inner, extra[s.name]), size) for s in known.sensors},
             aux=repeated(extra, size),
             asked=asked,
             known=asked,
@@ -169,12 +169,12 @@ class Delayed(FilterWrapper):
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)
         value, age = y if isinstance(y, DelayedMeasurement) else (y, jnp.zeros(()))
-        place = self.placed(held, which, value, age)
+        place = self.place_of(held, which, value, age)
         fresh = jax.tree_util.tree_map(lambda v: jnp.where(place.at_once, v, jnp.nan), value)
         inner, info = self.inner.update(_inner(state), sensor, fresh, aux)
         past = _entered(held.past, place, sensor.name, value, aux, info)
-        redone = self.redone(past, place, known, inner, info)
-        inner, before, gained, own, taken, failed = redone
+        repeat_steps = self.repeat_steps(past, place, known, inner, info)
+        inner, before, gained, own, taken, failed = repeat_steps
         told = _update_info(past, place, gained, own, taken, failed)
         past = past._replace(before=before, log_likelihood=gained)
         kept = DelayMemory(inner.memory, past, held.now, held.reach, known)
@@ -196,7 +196,7 @@ class Delayed(FilterWrapper):
         sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
         return which, Model(model.motion, sensors)
 
-    def placed(self, held: DelayMemory, which: int, value: Data, age: ArrayLike) -> _Place:
+    def place_of(self, held: DelayMemory, which: int, value: Data, age: ArrayLike) -> _Place:
         """Place in the buffer of a measurement of this age [steps]."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
@@ -211,7 +211,7 @@ class Delayed(FilterWrapper):
         at_once = used & (steps == 0) & ~overtaken
         return _Place(which, at, now, steps, there, too_old, used, at_once)
 
-    def redone(
+    def repeat_steps(
         self, past: _StepBuffer, place: _Place, known: Model, inner: FilterState, info: StepInfo
     ) -> _Repeated:
         """Repeat the steps from that of the measurement on, if `place.again`."""
@@ -286,8 +286,8 @@ def delayed(
     given = dict(aux or {})
     if unknown := set(given) - set(names):
         raise ValueError(f"aux names no sensor {sorted(unknown)}; the model has {sorted(names)}")
-    extra = {name: _plain(given.get(name)) for name in names}
-    return Delayed(filter_, model, _plain(u), extra, depth)
+    extra = {name: _as_arrays(given.get(name)) for name in names}
+    return Delayed(filter_, model, _as_arrays(u), extra, depth)
 
 
 def _entered(
@@ -319,11 +319,11 @@ def _update_info(
     again, total = place.again, (jnp.sum(past.log_likelihood), jnp.sum(gained))
     added = _change(*total, own, taken)
     code = _first_failure(own.code, again, failed)
-    placed = jnp.where(place.used, code, int(Code.REFUSED))
-    placed = jnp.where(place.too_old, int(Code.TOO_OLD), placed)
+    place_of = jnp.where(place.used, code, int(Code.REFUSED))
+    place_of = jnp.where(place.too_old, int(Code.TOO_OLD), place_of)
     return own._replace(
         log_likelihood=jnp.where(again, added, own.log_likelihood),
-        code=jnp.where(place.there, placed, code),
+        code=jnp.where(place.there, place_of, code),
     )
 
 
@@ -332,7 +332,7 @@ def _inner(state: FilterState) -> FilterState:
     return state._replace(memory=state.memory.inner)
 
 
-def _plain(tree: Data) -> Data:
+def _as_arrays(tree: Data) -> Data:
     """Tree with arrays in place of Python numbers, which have weak types."""
     return jax.tree_util.tree_map(lambda x: x if isinstance(x, jax.Array) else np.asarray(x), tree)
 
@@ -344,7 +344,7 @@ def _with(
     return {**rows, name: jax.tree_util.tree_map(enter, rows[name], value)}
 
 
-def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Data:
+def _no_reading(sensor: Sensor, state: FilterState, aux: Data) -> Data:
     """Measurement of a sensor without information: all NaN."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)

@@ -84,7 +84,7 @@ class DistributedFilter(JoinedFilter):
             return common_information_sum(beliefs, common=self.common)
         return information_sum(beliefs)
 
-    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
+    def divided(self, belief: Belief, shares: Array) -> list[Belief]:
         return [belief] * len(self.channels)
 
     def fed_back(self, state: FilterState) -> list[FilterState]:

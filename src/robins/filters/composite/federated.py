@@ -205,7 +205,7 @@ class Federated(JoinedFilter):
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
         return information_sum(beliefs)
 
-    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
+    def divided(self, belief: Belief, shares: Array) -> list[Belief]:
         return [Belief(belief.mean, one) for one in part(belief.factor, shares, self.sharing)]
 
     def first_shares(self, belief: Belief) -> Array:
@@ -252,7 +252,7 @@ class Federated(JoinedFilter):
         if self.mode == "no-reset":
             return list(members)
         reset = self.mode == "fusion-reset"
-        beliefs = self.parted(state.belief, a) if reset else _rescaled(members, self.keep)
+        beliefs = self.divided(state.belief, a) if reset else _rescaled(members, self.keep)
         return [f.reset(m, b) for f, m, b in zip(self.filters, members, beliefs, strict=True)]
 
     def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
@@ -272,7 +272,7 @@ class Federated(JoinedFilter):
         """Predict the fused belief, then divide it among the members."""
         _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
         members, codes, own = [], [], False
-        beliefs = self.parted(common.belief, a)
+        beliefs = self.divided(common.belief, a)
         for f, member, belief in zip(self.filters, state.memory.members, beliefs, strict=True):
             code = int(Code.DONE)
             if member.memory == ():  # a Kalman filter without rules

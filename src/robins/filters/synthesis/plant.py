@@ -37,7 +37,7 @@ class Plant(NamedTuple):
 
 
 class ErrorSystem(NamedTuple):
-    """Error of an observer: e(k+1) = A e + Bw w + Bn n, z - z^ = L e."""
+    """Error dynamics of an observer: e(k+1) = A e + Bw w + Bn n, z - z^ = L e."""
 
     A: np.ndarray  # (n, n)
     Bw: np.ndarray  # (n, p)

@@ -118,7 +118,7 @@ def _bits(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
 
 @rule("stop_gradient", "copy", "copy_p", "reduce_precision", "device_put", "optimization_barrier")
 @rule("name")
-def _as_it_is(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nodes]:
+def _unchanged(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nodes]:
     if equation.primitive.name == "reduce_precision" and equation.params["mantissa_bits"] < 52:
         raise ProgramError("numbers are rounded to fewer bits", "", "leave them in float64")
     return list(arrays)

@@ -49,7 +49,7 @@ from robins.ins.mechanise import step as navigate
 from robins.ins.state import InsNoise
 from robins.manifold import wrap
 from robins.rotation import Rotation, conjugate, rotate
-from robins.systems.airship.model import States, believed_noise, walk
+from robins.systems.airship.model import States, believed_noise, white_noise_factor
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import AirshipCourse, start_sigma
 
@@ -255,7 +255,7 @@ def _noise(
 ) -> Array:
     """Process noise as for the total state; longitude and latitude in radians."""
     per_metre = jnp.concatenate([jnp.ones(6), 1.0 / metres_per_radian[::-1], jnp.ones(1)])
-    return per_metre[:, None] * walk(noise, block.dt)
+    return per_metre[:, None] * white_noise_factor(noise, block.dt)
 
 
 @value

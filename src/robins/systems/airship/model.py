@@ -25,7 +25,7 @@ f = C (f_b - b_a), w_c = 2 w_ie + w_en and a subscript for a derivative, w_in,v 
     Q = G diag(q_g^2 I, q_a^2 I, 2 sigma^2/tau I) G',   G: -C into phi, -C into dv, I into dw.
 
 A step of a filter is an epoch; Phi and L, with Q = L L' over the step, are those of
-`robins.ins.transition`, or `walk` where there are no biases. H is in `instruments`.
+`robins.ins.transition`, or `white_noise_factor` where there are no biases. H is in `instruments`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def nine_states(noise: InsNoise) -> Motion:
     return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 
 
-def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
+def white_noise_factor(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
     """Factor L of Q over a step of constant white noise.
 
     Attitude is a random walk; velocity is another, with position as its integral,
@@ -94,14 +94,14 @@ def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
 
 
 def _noise(noise: InsNoise, x: Nav, block: Increments) -> Array:
-    return walk(noise, block.dt)
+    return white_noise_factor(noise, block.dt)
 
 
 def _linear(noise: InsNoise, x: Nav, block: Increments):
     """The step and its Jacobian, the first nine rows and columns of that of fifteen states."""
     one = jax.tree.map(lambda a: jnp.asarray(a, float)[None], block)
     new, Phi, _ = propagate_linear(InsState.start(x), one, noise, segments=1)
-    return new.nav, Phi[:9, :9], walk(noise, block.dt)
+    return new.nav, Phi[:9, :9], white_noise_factor(noise, block.dt)
 
 
 def with_biases(noise: InsNoise) -> Motion:

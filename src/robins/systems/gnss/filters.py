@@ -49,7 +49,7 @@ class GnssWorld(NamedTuple):
     truth: GnssState | None = None
 
 
-def weighing(name: str, weights: RobustWeights) -> tuple[Rule, ...]:
+def robust_rules(name: str, weights: RobustWeights) -> tuple[Rule, ...]:
     """Robust weighting rules of a filter; none for "ls", "ekf" and other names."""
     chosen = {
         "huber": huber_weight(weights.huber),
@@ -98,7 +98,7 @@ def contender(
     kind = KINDS[name]
     n = 8 + member.shape[1] + len(member) * kind.delays
     return Contender(
-        kalman(rules=weighing(name, believed.weights)),
+        kalman(rules=robust_rules(name, believed.weights)),
         gnss_model(believed, kind, place, member),
         Recipe(_case, (kind, believed), (place, np.asarray(member, float))),
         reported=np.eye(3, n),

@@ -360,6 +360,6 @@ class LiveGnss(Live):
         self._compiled_state = None if self._online is None else self._online.state
         self.start_over()
 
-    def _go_on_from(self, states: list[PyTree]) -> None:
-        super()._go_on_from(states)
+    def _resume_from(self, states: list[PyTree]) -> None:
+        super()._resume_from(states)
         self.epoch = None if self._last_step is None else self._epoch()

@@ -56,7 +56,7 @@ from robins.systems.streaming import (
     outcomes_of,
     outliers_of,
     stamp,
-    watched,
+    with_outcomes,
 )
 from robins.systems.study import Case
 
@@ -94,7 +94,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 def kept(step: Step) -> WatchedStep:
     """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
-    return watched(step, _vector(step.posterior))
+    return with_outcomes(step, _vector(step.posterior))
 
 
 def answer_of(
@@ -396,7 +396,7 @@ class LiveInsGnss(Live):
     def _known_states(self) -> list[PyTree]:
         return self._states
 
-    def _go_on_from(self, states: list[PyTree]) -> None:
-        super()._go_on_from(states)
+    def _resume_from(self, states: list[PyTree]) -> None:
+        super()._resume_from(states)
         self._states = states
         self.epoch = None if self._last_step is None else self._epoch()

@@ -62,7 +62,7 @@ _MONITORED_S = 60.0  # window of the monitor
 
 
 class Attitude(NamedTuple):
-    """Answer to a sample."""
+    """Attitude at the stamp of a sample."""
 
     time_ns: int
     q_nb: np.ndarray  # (4,) body to NED, scalar first; NaN while `STARTING`
@@ -208,7 +208,7 @@ class LiveMarg(Live):
         mark = self._saturated(gyro, accel, before)
         self._open = max(0, self._open - self._path.n * sum(len(s.still) for s in steps))
         if len(self._path.rows) > 1:
-            self._carry()
+            self._propagate()
         self._catch_up()
         return self._answer(time, mark)
 
@@ -239,7 +239,7 @@ class LiveMarg(Live):
         hard = bool(self._path.hard(accel[None])[0])
         return Flag.SATURATED if full or hard else Flag(0)
 
-    def _carry(self) -> None:
+    def _propagate(self) -> None:
         """Propagate the last attitude to the newest sample by the gyros."""
         rows = self._path.rows[-3:]
         made = self._path.increments(self._path.time_ns[-3:], rows[:, :3], rows[:, 3:6])

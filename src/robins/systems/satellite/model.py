@@ -23,7 +23,7 @@ from robins import linalg
 from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
-from robins.sim._given import Listed
+from robins.sim._arguments import Listed
 from robins.systems.satellite.gyro import walk_covariance
 from robins.systems.satellite.nodes import STAR, StateForm
 

@@ -247,7 +247,7 @@ def closed_shutter(*_: PyTree) -> tuple[Array, Array, Array]:
     return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
 
-def believable(q_ib: Array) -> BodyRotation:
+def plausible_attitude(q_ib: Array) -> BodyRotation:
     """An attitude as a measurement; one that is not a unit quaternion counts as missing."""
     off = jnp.abs(jnp.sum(q_ib * q_ib) - 1.0)
     return BodyRotation(jnp.where(off <= 2.0 * UNIT, q_ib, jnp.nan))
@@ -315,7 +315,7 @@ def react(
     }
     reading = Reading(
         u=theta,
-        y={STAR: believable(frame.q_ib)},
+        y={STAR: plausible_attitude(frame.q_ib)},
         aux={} if frame.factor is None else {STAR: frame.factor},
         truth=form.state(craft.q_ib, row.gyro_bias),
         rows=form.rows(craft.q_ib),

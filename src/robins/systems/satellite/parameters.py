@@ -15,7 +15,7 @@ _TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)
 
 
 class OrbitParameters(Parameters):
-    """A circular orbit, and the model of the magnetic field along it."""
+    """Circular orbit, and the model of the magnetic field along it."""
 
     altitude: Annotated[float, Quantity("length", least="100 km")] = default("500 km")
     inclination: q.AngleSize = default("97.4 deg")

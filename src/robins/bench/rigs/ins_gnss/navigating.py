@@ -100,7 +100,7 @@ class InsGnssConfig(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _logged(files: tuple[str, ...]) -> Dataset:
+def _read_log(files: tuple[str, ...]) -> Dataset:
     dataset = logs.clean(logs.load_dataset(files))
     if dataset.gnss is None or len(dataset.gnss) == 0:
         raise RigError("the log has no GNSS fixes", ", ".join(files), "give the receiver's file")
@@ -117,7 +117,7 @@ def _rate_hz(table: ImuTable | GnssTable | None) -> float:
 def timing(given: NavigationParameters) -> Timing:
     """Steps of a run, one per sample; those of a log in the order of its rows, gaps ignored."""
     if given.log:
-        samples = _logged(given.log).imu
+        samples = _read_log(given.log).imu
         return Timing(1.0 / _rate_hz(samples), len(samples), 0)
     lasts_s, rate_hz = given.duration, given.imu_rate
     if given.drive is not None:
@@ -136,7 +136,7 @@ def prepare(setup: Setup, given: NavigationParameters) -> InsGnssConfig:
     believed = InsGnssReplay(**{k: getattr(given, k) for k in InsGnssReplay.model_fields})
     dataset = None
     if given.log:
-        dataset = _logged(given.log)
+        dataset = _read_log(given.log)
         believed = with_lever_arm(believed, dataset.lever_arm_b_m)
     elif given.drive is not None:
         dataset = as_rates(drive_dataset(given.drive, setup.seed))

@@ -104,7 +104,7 @@ class _Determination:
         # A filter with rules gives no distance of a refused frame; one without does.
         self.plain = make_filter("quaternion" if self.additive else "mekf")
         self.sensor = config.model.sensor(STAR)
-        self.believable = compiled(config, nodes.believable)
+        self.plausible_attitude = compiled(config, nodes.plausible_attitude)
         self.report = compiled(config, self._report)
         self.judge = compiled(config, self._judge)
         self.fresh = compiled(config, self._fresh)
@@ -141,7 +141,7 @@ class _Determination:
             online.predict(gyro.values)
         sent, received = [], False
         if frame is not None:
-            y = self.believable(frame["q_ib"])
+            y = self.plausible_attitude(frame["q_ib"])
             received = bool(np.isfinite(np.asarray(y.wxyz)[0]))
             if not received and np.all(np.isfinite(frame["q_ib"])):
                 flags |= SHORT

@@ -41,7 +41,7 @@ from robins.systems.streaming import (
     outliers_of,
     refuse_units,
     stamp,
-    watched,
+    with_outcomes,
 )
 from robins.systems.transfer_alignment.product.log import contender
 from robins.systems.transfer_alignment.product.model import RECORDS
@@ -82,7 +82,7 @@ def predicted(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) ->
 
 def kept(step: Step) -> WatchedStep:
     """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
-    return watched(step, _vector(step.posterior))
+    return with_outcomes(step, _vector(step.posterior))
 
 
 def _vector(belief: Belief) -> jax.Array:
@@ -329,8 +329,8 @@ class LiveAlignment(Live):
         self._compiled_state = None if self._online is None else self._online.state
         self.start_over()
 
-    def _go_on_from(self, states: list[PyTree]) -> None:
-        super()._go_on_from(states)
+    def _resume_from(self, states: list[PyTree]) -> None:
+        super()._resume_from(states)
         self.epoch = None if self._last_step is None else self._epoch()
 
 

@@ -36,7 +36,7 @@ class BankLeg(Parameters):
 
 
 class Sway(Parameters):
-    """A sine of an angle."""
+    """Sinusoidal oscillation of an angle."""
 
     amplitude: q.AngleSize
     period: q.Duration
@@ -44,7 +44,7 @@ class Sway(Parameters):
 
 
 class Heave(Sway):
-    """A sine of height."""
+    """Sinusoidal oscillation of height."""
 
     amplitude: Annotated[float, Quantity("length", least="0 m", most="1 km")]
 
@@ -60,7 +60,7 @@ class Aircraft(Departure):
 
     @property
     def lasts_s(self) -> float:
-        """Duration."""
+        """Duration [s]."""
         return sum(leg.seconds for leg in self.legs)
 
 
@@ -77,7 +77,7 @@ class Ship(Departure):
 
     @property
     def lasts_s(self) -> float:
-        """Duration."""
+        """Duration [s]."""
         return self.seconds
 
 
@@ -92,7 +92,7 @@ class GroundVehicle(Departure):
 
     @property
     def lasts_s(self) -> float:
-        """Duration."""
+        """Duration [s]."""
         return sum(leg.lasts_s for leg in self.legs)
 
 
