@@ -37,9 +37,9 @@ def wall(monkeypatch):
 def test_lock_step_waits_for_nobody():
     clock = LockStep()
     assert clock.wait(3, lambda seconds: pytest.fail("it waited")) is None
-    assert clock.over(3) is False
+    assert clock.missed_deadline(3) is False
     assert clock.timeout_ns is None
-    clock.rested(10**9)
+    clock.shift_deadlines(10**9)
 
 
 def test_deadlines_are_of_the_grid_however_long_steps_take(wall):
@@ -48,7 +48,7 @@ def test_deadlines_are_of_the_grid_however_long_steps_take(wall):
     for k in range(50):
         found.append(clock.wait(k, wall.serve))
         wall.ns += 3_000_000 if k % 7 else 9_000_000
-        assert not clock.over(k)
+        assert not clock.missed_deadline(k)
     assert [b - a for a, b in itertools.pairwise(found)] == [10_000_000] * 49
     assert clock.timeout_ns == 10_000_000
 
@@ -59,7 +59,7 @@ def test_a_long_step_is_caught_up_with_or_skipped(wall):
     for policy, clock in clocks.items():
         first = clock.wait(0, wall.serve)
         wall.ns = first + 35_000_000
-        assert clock.over(0)
+        assert clock.missed_deadline(0)
         late[policy] = clock.wait(1, wall.serve) - first
     assert late == {"continue": 10_000_000, "skip": 40_000_000}
     assert clocks["skip"].skipped == 3
@@ -69,10 +69,10 @@ def test_abort_says_how_late_it_was(wall):
     clock = RealTime(100.0, "abort")
     first = clock.wait(0, wall.serve)
     wall.ns = first + 9_000_000
-    assert not clock.over(0)
+    assert not clock.missed_deadline(0)
     wall.ns = first + 22_000_000
     with pytest.raises(BenchError, match=r"step 0 ended 12.0 ms after the next one's deadline"):
-        clock.over(0)
+        clock.missed_deadline(0)
 
 
 @pytest.mark.parametrize("policy", ["continue", "skip"])
@@ -81,8 +81,8 @@ def test_a_run_that_falls_behind_says_so_again_when_that_has_doubled(wall, polic
     first = clock.wait(0, wall.serve)
     for k in range(90):  # each step takes eight periods, then none
         wall.ns += 8 * period_ns if k < 60 else 0
-        clock.over(k)
-        told += [(k, words)] if (words := clock.behind(k)) else []
+        clock.missed_deadline(k)
+        told += [(k, words)] if (words := clock.lag_notice(k)) else []
     late_s = [0.07 * (k + 1) for k, _ in told]
     assert late_s[0] == pytest.approx(1.0, abs=0.08)  # within a step
     assert late_s[1] == pytest.approx(2.0 * late_s[0], abs=0.08)
@@ -90,23 +90,23 @@ def test_a_run_that_falls_behind_says_so_again_when_that_has_doubled(wall, polic
         f"the run is {late:.1f} s behind its clock: 100 Hz is too fast" for late in late_s
     ]
     wall.ns = first + 2 * 10**9  # it has caught up, and falls behind again
-    assert clock.behind(199) == ""
+    assert clock.lag_notice(199) == ""
     wall.ns += 11 * 10**8
-    assert clock.behind(199).startswith("the run is 1.1 s behind")
-    assert LockStep().behind(3) == ""
+    assert clock.lag_notice(199).startswith("the run is 1.1 s behind")
+    assert LockStep().lag_notice(3) == ""
 
 
 def test_a_slow_clock_is_behind_by_periods(wall):
     clock = RealTime(0.5)
     wall.ns = clock.wait(0, wall.serve) + 21 * 10**9
-    assert clock.behind(0) == ""
+    assert clock.lag_notice(0) == ""
     wall.ns += 2 * 10**9
-    assert clock.behind(0).startswith("the run is 21.0 s behind")
+    assert clock.lag_notice(0).startswith("the run is 21.0 s behind")
 
 
 def test_a_pause_moves_all_deadlines(wall):
     clock = RealTime(100.0)
     first = clock.wait(0, wall.serve)
-    clock.rested(2_000_000_000)
+    clock.shift_deadlines(2_000_000_000)
     wall.ns += 2_000_000_000
     assert clock.wait(1, wall.serve) - first == 2_010_000_000

@@ -119,7 +119,7 @@ def place(tmp_path, monkeypatch):
 
 def test_a_report_is_a_file_of_its_own_that_nobody_else_reads(place):
     with BenchStatus() as status:
-        status.tell({"state": "running"})
+        status.report({"state": "running"})
         (path,) = place.iterdir()
         assert (place.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
         (place / "2147483647.json").write_text("{}")  # of a bench that was killed
@@ -149,7 +149,7 @@ def test_a_folder_of_others_is_refused_and_the_run_goes_on_without(place, tmp_pa
     goal = tmp_path / "goal"
     spoil(place, goal)
     with BenchStatus() as status:
-        status.tell({"state": "running"})
+        status.report({"state": "running"})
         assert re.search(f"does not show this run: {place}: .* {why}", status.refused)
     with pytest.raises(RobinsError, match=why) as caught:
         running()
@@ -175,7 +175,7 @@ def test_links_among_the_reports_lead_nowhere(place, tmp_path):
     with BenchStatus() as status:
         assert running() == []
         (place / f"{os.getpid()}.json").symlink_to(target)
-        status.tell({"state": "running"})
+        status.report({"state": "running"})
         assert target.read_text() == "kept"
         assert running()[0]["state"] == "running"
     assert target.read_text() == "kept"

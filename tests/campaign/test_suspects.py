@@ -99,12 +99,12 @@ def test_scores_are_those_of_loops():
         s.merge(chunk)
     assert sorted(s.suspects) == ["a", "b"]
     for name, chance in wrong.items():
-        np.testing.assert_allclose(s.wrong(name), chance.mean(axis=0), rtol=1e-14)
+        np.testing.assert_allclose(s.fault_probability(name), chance.mean(axis=0), rtol=1e-14)
         for run, row in enumerate(chance):
             right = [k for k in range(first, EPOCHS) if not faults[name][k]]
             share = sum(row[k] > 0.5 for k in right) / len(right)
             assert s.false_alarms(name)[run] == pytest.approx(share, rel=1e-14)
-            assert s.first_wrong(name)[run] == next(k for k in range(EPOCHS) if row[k] > 0.5)
+            assert s.first_alarm(name)[run] == next(k for k in range(EPOCHS) if row[k] > 0.5)
             expected, k = [], 0
             while k < EPOCHS:
                 if faults[name][k]:

@@ -31,7 +31,7 @@ def taken(path, time_ns, rows, size):
     made = []
     for at in range(0, len(rows), size):
         made += path.push(time_ns[at : at + size], rows[at : at + size])
-    return joined([*made, *path.finish()]), path.start(is_whole=True), dict(path.counts)
+    return joined([*made, *path.finish()]), path.start(is_complete=True), dict(path.counts)
 
 
 @pytest.mark.parametrize("kind", ["rate", "increment"])

@@ -23,7 +23,7 @@ def at_rest(block_s, rate, field):
     """(K,) bool, whether each block is at rest; and what the first rest shows."""
     watch, force = RestDetector(block_s, Rest()), np.array([0.0, 0.0, -GRAVITY])
     rows = zip(rate, field, strict=True)
-    still = [watch.look(block_s, one, force, field_b)[0] for one, field_b in rows]
+    still = [watch.process_block(block_s, one, force, field_b)[0] for one, field_b in rows]
     return SimpleNamespace(still=np.array(still), first=watch.first, first_sigma=watch.first_sigma)
 
 

@@ -19,10 +19,12 @@ def visits(*rests, starts_at_rest=True, apart_s=10.0, count=4):
     sites, out = Sites(count), []
     for rest in rests:
         field, force = rest if isinstance(rest, tuple) else (rest, DOWN)
-        looks = [sites.look(BLOCK_S, True, starts_at_rest, force, field) for _ in range(30)]
+        looks = [
+            sites.process_block(BLOCK_S, True, starts_at_rest, force, field) for _ in range(30)
+        ]
         out.append([look for look in looks if look is not NONE])
         for _ in range(round(apart_s / BLOCK_S)):
-            assert sites.look(BLOCK_S, False, starts_at_rest, DOWN, field) is NONE
+            assert sites.process_block(BLOCK_S, False, starts_at_rest, DOWN, field) is NONE
     return out
 
 
@@ -53,10 +55,10 @@ def test_a_log_that_begins_in_motion_has_no_first_site():
 def test_a_first_rest_too_short_to_be_read_leaves_no_first_site():
     sites = Sites(4)
     for _ in range(5):
-        assert sites.look(BLOCK_S, True, True, DOWN, HOME) is NONE
+        assert sites.process_block(BLOCK_S, True, True, DOWN, HOME) is NONE
     seen = []
     for still in [False] * 60 + [True] * 20 + [False] * 60 + [True] * 20:
-        seen.append(sites.look(BLOCK_S, still, True, DOWN, OTHER)[0])
+        seen.append(sites.process_block(BLOCK_S, still, True, DOWN, OTHER)[0])
     assert [site for site in seen if site >= 0] == [1, 1]
 
 

@@ -95,7 +95,7 @@ class BenchStatus:
         """True when the next report is due."""
         return time.monotonic() - self._told >= EACH_S
 
-    def tell(self, state: Report) -> None:
+    def report(self, state: Report) -> None:
         """Report the state; neither a full disk nor a folder of another user stops a run."""
         self._told = time.monotonic()
         content = json.dumps({**state, "pid": os.getpid(), "at": time.time()})

@@ -19,7 +19,7 @@ SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program
 
 
 class CompilationTrigger:
-    """Start of compiling the loops of a campaign, interpreted until that saves time."""
+    """Trigger that compiles the loops of a campaign once that is faster than to go on interpreting."""
 
     def __init__(self, stages: Sequence[StagedFunction]):
         self._loops: list[AxisLoop] = [

@@ -121,7 +121,7 @@ def _fault_sentences(problem: Problem, name: str, s: Statistics) -> list[str]:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
     remarks, suspects = [], s.suspects
     for suspect in suspects:
-        first = s.first_wrong(suspect)
+        first = s.first_alarm(suspect)
         if count := int(np.sum(first >= 0)):
             since = np.median(problem.epoch_s[first[first >= 0]])
             remarks.append(
@@ -134,7 +134,7 @@ def _fault_sentences(problem: Problem, name: str, s: Statistics) -> list[str]:
     return remarks
 
 
-def _scores(problem: Problem, s: Statistics) -> dict[str, float]:
+def _detection_metrics(problem: Problem, s: Statistics) -> dict[str, float]:
     """Detected share and detection delay of faults, and false alarms, by suspect or fault."""
     if not s.suspects or problem.faults is None:
         return {}
@@ -166,7 +166,7 @@ def _metrics(
     out = problem.metrics(s) | dict(problem.contenders[name].facts)
     if s.runs > 1:  # one run alone has no share
         out["diverged_share"] = Probability.among(s.lost)
-    out |= _scores(problem, s)
+    out |= _detection_metrics(problem, s)
     return out if bound is None else out | _over_bound(problem, s, bound)
 
 
@@ -295,7 +295,7 @@ def _fault_probabilities(problem: Problem, found: dict[str, Statistics]) -> dict
         return {}
     runs = next(iter(found.values())).runs
     if runs > 1:
-        mean = [{name: s.wrong(name) for name in s.suspects} for s in found.values()]
+        mean = [{name: s.fault_probability(name) for name in s.suspects} for s in found.values()]
         data |= probability_array("mean_wrong", mean, runs=runs)
     if problem.faults is not None:
         none = np.zeros(len(problem.epoch_s), bool)

@@ -338,11 +338,11 @@ class Statistics:
         names = [name for name in self.sums if name.startswith("wrong ")]
         return [name.removeprefix("wrong ") for name in names]
 
-    def wrong(self, suspect: str) -> np.ndarray:
+    def fault_probability(self, suspect: str) -> np.ndarray:
         """(E,) mean fault probability of a suspect."""
         return self.sums[f"wrong {suspect}"] / self.runs
 
-    def first_wrong(self, suspect: str) -> np.ndarray:
+    def first_alarm(self, suspect: str) -> np.ndarray:
         """(runs,) epoch of its first alarm; -1: none."""
         return self._all(f"first wrong {suspect}")
 

@@ -145,7 +145,7 @@ def choose(
         raise UndeterminedError(
             f"{' and '.join(idle)} changes nothing that the filter says: leave it out"
         )
-    x = _least(slopes, len(names))
+    x = _minimiser(slopes, len(names))
     for name, one in zip(names, x, strict=True):
         if abs(one) > 0.98 * FARTHEST:
             way = "large" if one > 0.0 else "small"
@@ -155,7 +155,7 @@ def choose(
     sigma = _sigma(slopes, x, names)
     progress(0.95, "judging on data held out")
     before, after = slopes.parts([x0, x], judged_on)
-    gain, low = _gain(objective.total, before, after)
+    gain, low = _improvement(objective.total, before, after)
     return Tuned(
         x, sigma, slopes.gradient, slopes.evaluations, before, after, gain, low, slopes.notes
     )
@@ -252,7 +252,7 @@ def _by_mean(total: Callable[[np.ndarray], float], mean: np.ndarray) -> np.ndarr
     return np.array([(a - b) / (2.0 * s) for (a, b), s in zip(ends, steps, strict=True)])
 
 
-def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
+def _minimiser(slopes: ObjectiveGradient, p: int) -> np.ndarray:
     """Minimiser x of the objective."""
     edge = [(-FARTHEST, FARTHEST)] * p
     if slopes.gradient:
@@ -295,10 +295,10 @@ def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np
     turned = axes.T @ within @ axes * np.outer(scale, scale)
     lost = np.isnan(scale)
     spread = np.where(np.outer(lost, lost), np.inf, np.nan_to_num(turned))
-    sigma = np.array([_along(row, spread) for row in axes])
+    sigma = np.array([_component_sigma(row, spread) for row in axes])
     z = ndtri(0.975)
     wide = [
-        f"{name} is known to a factor of {_times(math.exp(min(z * s, 700.0)))} either way"
+        f"{name} is known to a factor of {_factor_text(math.exp(min(z * s, 700.0)))} either way"
         for name, s in zip(names, sigma, strict=True)
         if z * s > TOO_WIDE
     ]
@@ -310,7 +310,7 @@ def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np
     return sigma
 
 
-def _along(row: np.ndarray, spread: np.ndarray) -> float:
+def _component_sigma(row: np.ndarray, spread: np.ndarray) -> float:
     """Standard deviation of a component; infinite if an undetermined axis contributes to it."""
     endless = np.isinf(np.diag(spread))
     if np.any(endless & (np.abs(row) > 1e-6)):
@@ -320,11 +320,11 @@ def _along(row: np.ndarray, spread: np.ndarray) -> float:
     )
 
 
-def _times(factor: float) -> str:
+def _factor_text(factor: float) -> str:
     return f"{factor:.3g}" if factor < 1e6 else "more than a million"
 
 
-def _gain(
+def _improvement(
     total: Callable[[np.ndarray], float], before: np.ndarray, after: np.ndarray
 ) -> tuple[float, float]:
     """Decrease of the objective, and its 95 % lower bound by the jackknife over the parts."""

@@ -102,7 +102,7 @@ def field_notes(
         ("reset_belief", "factor"): "above the diagonal not looked at",
     }
     mean = state.belief.mean
-    for root in _roots(state):
+    for root in _mean_paths(state):
         for name, first, last, own in tangent_fields(mean, root):
             if text := _joined_note(own, _components_text(axes[first:last], first)):
                 notes["state", name] = text
@@ -125,7 +125,7 @@ def field_notes(
     return {**notes, **problem.fields}
 
 
-def _roots(state: State) -> Iterator[str]:
+def _mean_paths(state: State) -> Iterator[str]:
     """Paths of the means in a state that have the structure of the state's own mean."""
     parts = jax.tree_util.tree_flatten_with_path(state, is_leaf=lambda x: isinstance(x, Belief))[0]
     own = jax.tree_util.tree_structure(state.belief.mean)

@@ -33,7 +33,7 @@ _ROLES = ("bound", "bound_prior", "bound_unaided", "bound_without")
 
 
 def line(solution: xr.Dataset, block: str, role: str = "bound") -> Series:
-    """The bound of a block (..., time, axis), one standard deviation; of the prior (axis,).
+    """Bound of a block (..., time, axis), or that of the prior (axis,), one standard deviation.
 
     Raises:
         KeyError: the solution has no such bound.

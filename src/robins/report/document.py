@@ -131,7 +131,7 @@ def _claims(claims: Sequence[Claim]) -> str:
         [
             _td(f"{_SIGNS[c['verdict']]} {c['verdict']}", f"tag {c['verdict']}"),
             f"<td>{escape(c['text'])} <span class='meta'>({escape(c['id'])})</span></td>",
-            _td(numbers.found(c["value"], c.get("interval")), "number"),
+            _td(numbers.claim_value(c["value"], c.get("interval")), "number"),
             _td(numbers.band(c["band"]), "number"),
         ]
         for c in claims

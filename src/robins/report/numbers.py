@@ -149,7 +149,7 @@ def verdict_class(verdict: str) -> str:
     return next((state for begin, state in _STATES.items() if verdict.startswith(begin)), "")
 
 
-def found(
+def claim_value(
     value: float | int | str | Sequence[float] | None, interval: Sequence[float] | None = None
 ) -> str:
     """The value of a claim, with its 95 % interval where there is one."""

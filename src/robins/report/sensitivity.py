@@ -285,7 +285,7 @@ def doubts(solution: xr.Dataset, follow: Sequence[bool]) -> list[str]:
 
 
 def greatest(solution: xr.Dataset) -> int | None:
-    """Index of the parameter with the greatest total Sobol index of any block; None: there is none."""
+    """Index of the parameter with the greatest total index of any block; None: there is none."""
     total = np.stack([np.asarray(x, float) for x in find(solution, "sobol_total").values()])
     known = np.nan_to_num(total, nan=-np.inf)
     if not np.any(np.isfinite(known)):

@@ -49,7 +49,7 @@ def table(summary: Summary, width: int = 100) -> Group:
             claims.add_row(
                 Text(verdict, style=_COLOURS[verdict]),
                 Text(claim["text"]),
-                numbers.found(claim["value"], claim.get("interval")),
+                numbers.claim_value(claim["value"], claim.get("interval")),
                 numbers.band(claim["band"]),
             )
         parts += [Text(), claims, Text(numbers.verdict(summary["claims"]))]

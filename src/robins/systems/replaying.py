@@ -172,7 +172,7 @@ def gap_counts(pieces: Sequence[LogPiece], problems: Sequence[str]) -> dict[str,
 # ----------------------------------------------------------------------------- pieces to answers
 
 
-def kept(step: Step) -> tuple[PyTree, Array, dict[str, SensorUpdates]]:
+def kept_step(step: Step) -> tuple[PyTree, Array, dict[str, SensorUpdates]]:
     """Keep the posterior's mean and standard deviations, and the updates by sensor.
 
     For a bank, also keep the probability of each mode.
@@ -218,8 +218,10 @@ def _piece_estimates(
     with warnings.catch_warnings():
         # the outcome reports these among its warnings
         warnings.simplefilter("ignore", StepWarning)
-        found, why = _run_case(contender, case, everything if smoothed else kept, piece.epoch_s)
-        of_steps = mapped_rows(kept, found.steps) if smoothed else found.steps
+        found, why = _run_case(
+            contender, case, everything if smoothed else kept_step, piece.epoch_s
+        )
+        of_steps = mapped_rows(kept_step, found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.with_innovations(seen, case.y)

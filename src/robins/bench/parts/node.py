@@ -63,7 +63,7 @@ def fewer_collections() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run a part until the bench sends stop or has gone."""
+    """Run a part until the bench sends stop or disconnects."""
     try:
         return _run_part(arguments)
     except RobinsError as error:  # the bench shows its last line to the user

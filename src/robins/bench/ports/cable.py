@@ -29,7 +29,7 @@ class Cable(NamedTuple):
 
 @contextlib.contextmanager
 def cable() -> Iterator[Cable]:
-    """A cable for as long as the context lasts; unread bytes wait at its end."""
+    """Context with a cable between two pseudo-terminals; unread bytes wait at its end."""
     with contextlib.ExitStack() as stack:
         one, other = (stack.enter_context(open_pair()) for _ in range(2))
         wake, woken = os.pipe()

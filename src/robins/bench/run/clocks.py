@@ -27,15 +27,15 @@ class LockStep:
         """Return at once; there is no deadline."""
         return None
 
-    def over(self, step: int) -> bool:
+    def missed_deadline(self, step: int) -> bool:
         """False: in lock-step there is no deadline to miss."""
         return False
 
-    def behind(self, step: int) -> str:
+    def lag_notice(self, step: int) -> str:
         """Empty: in lock-step there is no clock to be behind."""
         return ""
 
-    def rested(self, ns: int) -> None:
+    def shift_deadlines(self, ns: int) -> None:
         """Ignore a pause of the run: there are no deadlines."""
 
 
@@ -84,12 +84,12 @@ class RealTime:
                 serve((left - _SPIN_NS) * 1e-9)
         return deadline
 
-    def rested(self, ns: int) -> None:
+    def shift_deadlines(self, ns: int) -> None:
         """Move all deadlines by the duration of a pause [ns]."""
         if self._began_ns is not None:
             self._began_ns += ns
 
-    def behind(self, step: int) -> str:
+    def lag_notice(self, step: int) -> str:
         """Notice that the run is far behind its clock after a step: once, and again whenever the
         lag has doubled; else empty. Skipped deadlines count too.
         """
@@ -102,7 +102,7 @@ class RealTime:
         self._alarm_s = 2.0 * late_s
         return f"the run is {late_s:.1f} s behind its clock: {self._rate_hz:g} Hz is too fast"
 
-    def over(self, step: int) -> bool:
+    def missed_deadline(self, step: int) -> bool:
         """True if the step just completed has missed the deadline of the next one.
 
         Raises:

@@ -123,7 +123,7 @@ class PartProcesses:
         """Idle time of the process of a part [s]; see `idleness`."""
         return self._idle_s(self.process(part))
 
-    def remembers(self, part: str, step: int) -> bool:
+    def has_saved_memory(self, part: str, step: int) -> bool:
         """True if a part has saved its memory after a step."""
         assert self._folder is not None
         return path_of(self._folder, part, step).exists()

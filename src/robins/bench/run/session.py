@@ -198,14 +198,14 @@ class Session:
                 deadline = self.clock.wait(k, self.broker.poll)
                 began = time.monotonic_ns()
                 self.broker.step(k, self.clock.timeout_ns)
-                missed = self.clock.over(k)
+                missed = self.clock.missed_deadline(k)
                 ended = time.monotonic_ns()
                 self.latencies.cycle(k, deadline, began, ended, missed)
                 self.done, self.step_ms = k + 1, (ended - began) * 1e-6
                 if missed:
                     text = f"step {k} was not over at the deadline of the next"
                     self.event("missed", text, False)
-                if behind := self.clock.behind(k):
+                if behind := self.clock.lag_notice(k):
                     self.event("behind", behind)
                 if self._watch is not None:
                     self._catch_up()
@@ -238,7 +238,7 @@ class Session:
                 if not self._paused or self._stop:
                     break
                 self.broker.poll(0.05)
-            self.clock.rested(time.monotonic_ns() - began)
+            self.clock.shift_deadlines(time.monotonic_ns() - began)
         if not self._stop:
             self._say(step)
 
@@ -322,7 +322,7 @@ class Session:
         if setup.on_death == "restart":
             own = set(links) - set(self.ports)
             self._histories = {
-                p: SentFrames(partial(self.part_processes.remembers, p)) for p in own
+                p: SentFrames(partial(self.part_processes.has_saved_memory, p)) for p in own
             }
         return Broker(
             links,

@@ -132,7 +132,7 @@ class PageObserver:
             self._told = now
             self._page.status(self._state(session, done))
         if self._status.due:
-            self._status.tell(report(session, done, "" if self._page is None else self._page.url))
+            self._status.report(report(session, done, "" if self._page is None else self._page.url))
 
 
 def state(session: Session, done: int) -> JsonObject:

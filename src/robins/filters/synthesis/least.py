@@ -80,11 +80,11 @@ def least_gamma(plant: Plant) -> LeastGamma:
     best = kalman_design(plant)
     scales = balanced(plant)
     scaled, unit = scales.plant(plant), scales.hinf(1.0)
-    low, above, step = _edge(scaled, _NOTHING, best.hinf / unit)
+    low, above, step = _gamma_bracket(scaled, _NOTHING, best.hinf / unit)
     enough = max(low * (1.0 + _REACHED), _NOTHING) * unit
     for noise in _NOISES:
         if noise:
-            _, above, _ = _edge(scaled, max(low, _NOTHING), best.hinf / unit, noise)
+            _, above, _ = _gamma_bracket(scaled, max(low, _NOTHING), best.hinf / unit, noise)
         for gamma in (above * (1.0 + _RTOL), 1.01 * above, np.inf):
             if best.hinf <= enough:
                 break
@@ -100,7 +100,9 @@ def least_gamma(plant: Plant) -> LeastGamma:
     return LeastGamma(min(low * unit, reached), step, reached, best)
 
 
-def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[float, float, int]:
+def _gamma_bracket(
+    plant: Plant, low: float, high: float, noise: float = 0.0
+) -> tuple[float, float, int]:
     """Greatest gamma (or 0) at which the recursion ends, least at which it does not, end step."""
     step = _last_gain(plant, low, noise)[1] if low < high else 0
     if not step:

@@ -71,13 +71,13 @@ class RoadNavigation(NamedTuple):
         return Geodetic.from_ecef(jnp.asarray(self.r_e))
 
 
-def predicted(filter_: Filter, model: Model, state: FilterState, u: MotionStep) -> jax.Array:
+def predicted_vector(filter_: Filter, model: Model, state: FilterState, u: MotionStep) -> jax.Array:
     """State after a step, in one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
-def kept(step: Step) -> WatchedStep:
-    """Posterior as in `predicted`, then code, NIS and number of the pseudoranges of the epoch."""
+def posterior_vector(step: Step) -> WatchedStep:
+    """Posterior as in `predicted_vector`, then code, NIS and number of the pseudoranges."""
     info = step.info[RANGES]
     outcome = [jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)]
     return WatchedStep.of(step, jnp.concatenate([_vector(step.posterior), jnp.stack(outcome)]))
@@ -91,7 +91,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 
 def answer_of(time_ns: int, place: LocalFrame, x: np.ndarray, flags: Flag) -> RoadNavigation:
-    """Unpack a vector of `predicted` or `kept` into an answer.
+    """Unpack a vector of `predicted_vector` or `posterior_vector` into an answer.
 
     Args:
         time_ns: its stamp.
@@ -292,7 +292,7 @@ class LiveGnss(Live):
             if self._online is None:
                 self._begin(world)
             assert self._online is not None
-            found = self._online.step(world.y, world.u, {RANGES: world.sky}, keep=kept)
+            found = self._online.step(world.y, world.u, {RANGES: world.sky}, keep=posterior_vector)
             self._last_step = time_ns, np.asarray(found)
             self.epoch = self._epoch()
             self.passed.append(self.epoch)
@@ -334,7 +334,7 @@ class LiveGnss(Live):
         if self._online is None or self.epoch is None:
             none = np.full(3, np.nan)
             return RoadNavigation(newest, none, none, math.nan, math.nan, mark | Flag.STARTING)
-        found = np.asarray(self._online.look(predicted, self._path.since()))
+        found = np.asarray(self._online.look(predicted_vector, self._path.since()))
         answer = answer_of(newest, self._place, found, mark | self.epoch.flags)
         return answer._replace(code=self.epoch.code, nis=self.epoch.nis, dof=self.epoch.dof)
 

@@ -80,7 +80,7 @@ class Navigation(NamedTuple):
     seen: Mapping[str, MeasurementOutcome] = {}  # by sensor, in the last step of the filter
 
 
-def predicted(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
+def predicted_vector(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
     """Predicted mean and standard deviations after a block, as one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
@@ -92,8 +92,8 @@ def _vector(belief: Belief) -> jax.Array:
     return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
 
 
-def kept(step: Step) -> WatchedStep:
-    """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
+def posterior_vector(step: Step) -> WatchedStep:
+    """Posterior as in `predicted_vector`, then sensor outcomes and probabilities of suspects."""
     return with_outcomes(step, _vector(step.posterior))
 
 
@@ -104,13 +104,13 @@ def answer_of(
     sensors: Sequence[str] = (),
     suspects: Sequence[str] = (),
 ) -> Navigation:
-    """Unpack a vector of `predicted` or `kept` into an answer.
+    """Unpack a vector of `predicted_vector` or `posterior_vector` into an answer.
 
     Args:
         time_ns: stamp of the answer.
         x: the vector.
         flags: of the answer.
-        sensors: names of those in a vector of `kept`, in order.
+        sensors: names of those in a vector of `posterior_vector`, in order.
         suspects: of a bank.
     """
     lat, lon, alt = x[7:10].tolist()
@@ -301,7 +301,7 @@ class LiveInsGnss(Live):
     def _step(self, epoch: tuple[float, float], u: ImuBlock, y: PyTree, aux: PyTree) -> None:
         """Step the filter to an epoch, with the measurements there."""
         assert self._online is not None
-        found = np.asarray(self._online.step(y, u, aux, keep=kept))
+        found = np.asarray(self._online.step(y, u, aux, keep=posterior_vector))
         time_ns = round(epoch[0] * 1e9) + self._path.imu.origin_ns
         self._last_step = time_ns, found, sorted(y)
         self.epoch = self._epoch()
@@ -364,7 +364,7 @@ class LiveInsGnss(Live):
             starting = mark | Flag.STARTING
             return Navigation(time_ns, none[:4], none[:3], nan, nan, nan, none, starting)
         u = jax.tree_util.tree_map(lambda a: a[0], self._path.since(self._past[-1][0]))
-        found = self._online.look(predicted, u)
+        found = self._online.look(predicted_vector, u)
         answer = answer_of(time_ns, np.asarray(found), mark)
         if self.epoch is None:
             return answer

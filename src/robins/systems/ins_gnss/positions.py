@@ -55,7 +55,7 @@ def course_fix(log: Log, start: InsGnssStart) -> int | None:
     missing = np.ones(len(log.gnss_s), bool)
     if log.gnss.v_n is not None:
         missing = ~np.all(np.isfinite(log.gnss.v_n[:, :2]), axis=1)
-    ends = np.flatnonzero(missing & _whole(log))
+    ends = np.flatnonzero(missing & _is_complete(log))
     v, sigma, _ = best_lines(log, ends, start.tilt)
     speed = np.hypot(v[:, 0], v[:, 1])
     sure = ends[speed >= np.maximum(start.course_speed, SURE * sigma)]
@@ -136,7 +136,7 @@ def fitted(
     return q_nb, p[0], v[0], spread[0] + np.outer(drift, drift)
 
 
-def _whole(log: Log) -> np.ndarray:
+def _is_complete(log: Log) -> np.ndarray:
     """Mask (M,) of complete fixes within the time of the IMU that are not withheld."""
     g, begin_s = log.gnss, log.time_s[0] - log.increments.dt[0]
     whole = np.all(np.isfinite([g.lat_rad, g.lon_rad, g.alt_m]), axis=0) & ~log.withheld
@@ -150,7 +150,7 @@ def _gathered(
 
     NaN times and positions fill up windows with fewer fixes.
     """
-    known, g = np.flatnonzero(_whole(log)), log.gnss
+    known, g = np.flatnonzero(_is_complete(log)), log.gnss
     wanted = log.gnss_s[ends][:, None] - window_s * np.linspace(1.0, 0.0, MOST) - 1e-6
     at = np.minimum(np.searchsorted(log.gnss_s[known], wanted), max(len(known) - 1, 0))
     once = np.diff(at, axis=1, prepend=-1) > 0

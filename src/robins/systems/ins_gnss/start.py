@@ -135,7 +135,7 @@ def find_start(
             no complete fix, or none after that time; or the mean specific force is not gravity.
     """
     usual, gnss, g = usual or usual_of(log), gnss or Gnss(), log.gnss
-    whole = _whole_fixes(log)
+    whole = _complete_fixes(log)
     some, given = int(whole[0]), start.known_heading is not None
     fast, by_way, unknown = (None, False, "") if given else fast_fix(log, start)
     if unknown and log.field_b is None:
@@ -170,7 +170,7 @@ def find_start(
     return _by_positions(log, found, at, later, stands, start, gnss, by_way)
 
 
-def _whole_fixes(log: Log) -> np.ndarray:
+def _complete_fixes(log: Log) -> np.ndarray:
     """Rows of complete fixes (three coordinates) within the time of the increments.
 
     Raises:
@@ -218,7 +218,7 @@ def _levelled(
         first = min(width - 1, last)
         at = first + int(np.argmin(np.sum(spread[first : last + 1] ** 2, axis=1)))
         tilt, how, bias = 3.0 * start.tilt, "on the quietest second, moving", np.zeros(3)
-    force, some = mean_force[at], _whole_fixes(log)[0]
+    force, some = mean_force[at], _complete_fixes(log)[0]
     place = (np.asarray(x[some], float) for x in (log.gnss.lat_rad, log.gnss.alt_m))
     here = np.linalg.norm(gravity_n(*place))
     if not 0.5 * here < np.linalg.norm(force) < 1.5 * here:

@@ -42,7 +42,7 @@ from robins.systems.marg.log import earth_field
 from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.path import MargSteps, SamplePath
 from robins.systems.marg.replay import stated_sigma
-from robins.systems.replaying import kept
+from robins.systems.replaying import kept_step
 from robins.systems.streaming import (
     Flag,
     Live,
@@ -89,7 +89,7 @@ _SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 1, 8])
 
 def _kept(step: Step) -> WatchedStep:
     """A `_Step` as one vector."""
-    mean, sigma, seen = kept(step)
+    mean, sigma, seen = kept_step(step)
     parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
     parts += [sigma, step.prediction.code[None]]
     travel = seen[model.TRAVEL]
@@ -172,7 +172,7 @@ class LiveMarg(Live):
         rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -gravity, 2e-5, 2e-5, 2e-5], (count, 1))
         time_ns = (np.arange(count) * 1e9 * self._usual_s).astype(np.int64)
         self._wait(self._path.push(time_ns, rows))
-        found = self._path.start(is_whole=True)
+        found = self._path.start(is_complete=True)
         assert found is not None
         self._online = self._on(found[1])
         self._compiled_state = self._online.state

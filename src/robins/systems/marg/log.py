@@ -78,7 +78,7 @@ def prepare(dataset: Dataset, parameters: MargReplay) -> PreparedMargLog:
     ends = levels(gyro, float(np.median(dt))) if imu.kind == "rate" else None
     path = SamplePath(parameters, usual_interval(dt), imu.kind, ends)
     steps = joined([*path.push(time_ns, np.hstack([gyro, imu.accel, field])), *path.finish()])
-    found_start = path.start(is_whole=True)
+    found_start = path.start(is_complete=True)
     assert found_start is not None
     look, belief = found_start
     rows = np.minimum((np.arange(len(steps.still)) + 1) * path.n, len(dt))

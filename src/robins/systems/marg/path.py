@@ -116,7 +116,7 @@ class SamplePath:
             self.time_ns = np.concatenate([self.time_ns, time_ns[new]])
             self.rows = np.concatenate([self.rows, rows[new]])
             self._context = max(self._context, 1)  # the first sample of all begins the first block
-            if blocks := self._whole_blocks():
+            if blocks := self._complete_blocks():
                 made.append(self._cut(self._context + blocks * self.n))
         return made
 
@@ -124,18 +124,18 @@ class SamplePath:
         """Steps of the remaining samples; the last block may be short."""
         return [self._cut(len(self.rows))] if self.waiting > 0 else []
 
-    def start(self, is_whole: bool = False) -> tuple[FilterStart, Belief] | None:
+    def start(self, is_complete: bool = False) -> tuple[FilterStart, Belief] | None:
         """Start and initial belief, once later samples cannot change them; None before.
 
         Args:
-            is_whole: True if no samples follow.
+            is_complete: True if no samples follow.
         """
         p = self._parameters
         if not self._begun:
             return None
         increments, field = self.until_start
         lasted = float(np.sum(increments.dt))
-        if not is_whole:
+        if not is_complete:
             if lasted <= (p.start.moving if self._in_motion else p.start.still):
                 return None
             if not self._watch.settled:
@@ -161,10 +161,10 @@ class SamplePath:
 
     # ------------------------------------------------------------------------ samples to blocks
 
-    def _whole_blocks(self) -> int:
+    def _complete_blocks(self) -> int:
         """Number of blocks whose samples are complete, including the flanks of their peaks."""
         count, full = 0, self.full(self.rows[:, :3])
-        while self._is_whole(self._context + count * self.n, full):
+        while self._is_complete(self._context + count * self.n, full):
             count += 1
         return count
 
@@ -180,7 +180,7 @@ class SamplePath:
             return np.zeros(len(accel), bool)
         return np.any(np.abs(accel) >= 0.99 * self._parameters.accelerometer.range, axis=1)
 
-    def _is_whole(self, begin: int, full: np.ndarray) -> bool:
+    def _is_complete(self, begin: int, full: np.ndarray) -> bool:
         """True if all samples needed by a block are there; it begins after sample `begin - 1`."""
         end, time_ns = begin + self.n, self.time_ns
         needed = end + (self._parameters.update.samples == "instants")
@@ -286,9 +286,11 @@ class SamplePath:
         force = mean_force(integrals)
         still, sigma, looks = np.zeros(len(times), bool), np.zeros(len(times)), []
         for k, dt in enumerate(times):
-            still[k], sigma[k] = self._watch.look(dt, rate[k], force[k], field_b[k])
+            still[k], sigma[k] = self._watch.process_block(dt, rate[k], force[k], field_b[k])
             starts_at_rest = self._watch.first is not None
-            looks.append(self._sites.look(dt, bool(still[k]), starts_at_rest, force[k], field_b[k]))
+            looks.append(
+                self._sites.process_block(dt, bool(still[k]), starts_at_rest, force[k], field_b[k])
+            )
         weight = p.accelerometer.gravity * np.asarray(integrals.dt_s)
         falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
         self.counts["blocks_in_free_fall"] += int(np.sum(falling))
@@ -326,7 +328,7 @@ class SamplePath:
             u: the blocks.
             field_b: (K, 3) T, mean field in body axes at the end of each.
             sigma: (K,) rad/s, of the mean rate at rest.
-            looks: K results of `Sites.look`.
+            looks: K results of `Sites.process_block`.
         """
         p, pace, time = self._parameters, self._pace, np.asarray(u.samples.dt_s)
         clock = np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]

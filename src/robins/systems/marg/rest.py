@@ -51,7 +51,7 @@ class RestDetector:
         """True once it is known whether the log begins with a rest of at least `rest.after`."""
         return not (self._able and self._unbroken) or self.first is not None
 
-    def look(
+    def process_block(
         self, dt_s: float, rate: np.ndarray, force: np.ndarray, field: np.ndarray
     ) -> tuple[bool, float]:
         """Process a block: True if the unit is at rest in it, and sigma of its mean rate [rad/s].

@@ -42,7 +42,7 @@ class Sites:
         self._moved_s, self._rest_s, self._rests = np.inf, 0.0, False
         self._sums = np.zeros((2, 3))  # time integrals of field and specific force over this rest
 
-    def look(
+    def process_block(
         self, dt_s: float, still: bool, starts_at_rest: bool, force: np.ndarray, field: np.ndarray
     ) -> Look:
         """Process a block; return the site read at its end, or `NONE`.

@@ -49,7 +49,7 @@ class MatchingWorld(NamedTuple):
 
 
 def lay_out(given: AttitudeMatching) -> MatchingCourse:
-    """Everything that does not depend on a run, in NumPy.
+    """Set up, in NumPy, everything that does not depend on the run.
 
     Warns where errors will outgrow the linear model.
 

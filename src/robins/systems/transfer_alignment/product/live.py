@@ -75,13 +75,13 @@ class SlaveAlignment(NamedTuple):
     seen: Mapping[str, MeasurementOutcome] = {}  # by sensor, in the last step of the filter
 
 
-def predicted(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
+def predicted_vector(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
     """Predicted estimate and standard deviations after a block, as one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
-def kept(step: Step) -> WatchedStep:
-    """Posterior as in `predicted`, then outcomes of the sensors and probabilities of suspects."""
+def posterior_vector(step: Step) -> WatchedStep:
+    """Posterior as in `predicted_vector`, then sensor outcomes and probabilities of suspects."""
     return with_outcomes(step, _vector(step.posterior))
 
 
@@ -93,7 +93,7 @@ def _vector(belief: Belief) -> jax.Array:
 
 
 def answer_of(time_ns: int, x: np.ndarray, flags: Flag) -> SlaveAlignment:
-    """Unpack a vector of `predicted` or `kept` into an answer."""
+    """Unpack a vector of `predicted_vector` or `posterior_vector` into an answer."""
     lat, lon, alt = x[7:10].tolist()
     biases = x[10:13], x[13:16], x[16:19]
     return SlaveAlignment(time_ns, x[:4], x[4:7], lat, lon, alt, *biases, x[19:_WIDTH], flags)
@@ -288,7 +288,9 @@ class LiveAlignment(Live):
         assert self._online is not None
         block, master, lag = jax.tree.map(lambda a: np.asarray(a)[k], steps)
         y = {name: getattr(master, RECORDS[name].field) for name in self._matched}
-        found = self._online.step(y, block, dict.fromkeys(self._matched, lag), keep=kept)
+        found = self._online.step(
+            y, block, dict.fromkeys(self._matched, lag), keep=posterior_vector
+        )
         self._last_step = round(epoch[0] * 1e9) + self._path.imu.origin_ns, np.asarray(found)
         self._at, self.epoch = epoch, self._epoch()
         self.passed.append(self.epoch)
@@ -308,7 +310,7 @@ class LiveAlignment(Live):
         if self._online is None:
             return answer_of(time_ns, np.full(_WIDTH, np.nan), mark | Flag.STARTING)
         u = jax.tree.map(lambda a: np.asarray(a)[0], self._path.since(self._at[0]))
-        found = self._online.look(predicted, u)
+        found = self._online.look(predicted_vector, u)
         answer = answer_of(time_ns, np.asarray(found), mark)
         if self.epoch is None:
             return answer

@@ -29,7 +29,7 @@ from robins.systems.study import Scenario
 
 
 class BankLeg(Parameters):
-    """A bank angle, right wing down positive, and how long the leg lasts."""
+    """Bank angle, right wing down positive, and duration of the leg."""
 
     bank: Annotated[float, Quantity("angle", above="-85 deg", below="85 deg")]
     seconds: q.Duration

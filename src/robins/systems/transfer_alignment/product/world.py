@@ -114,7 +114,7 @@ def _waves(waves) -> tuple[Wave, ...]:
 
 
 def lay_out(pair: PairParameters) -> PairCourse:
-    """Everything that does not depend on a run.
+    """Set up everything that does not depend on the run.
 
     Raises:
         ValueError: an impossible motion; rates that do not divide; a run shorter than an epoch; a

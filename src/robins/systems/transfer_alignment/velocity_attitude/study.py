@@ -134,7 +134,7 @@ class VelocityAttitudeCourse:
 
 
 def lay_out(given: VelocityAttitude) -> VelocityAttitudeCourse:
-    """Everything that does not depend on a run.
+    """Set up everything that does not depend on the run.
 
     Warns where errors will outgrow the linear model.
 
