@@ -19,7 +19,7 @@ SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program
 
 
 class CompilationTrigger:
-    """Trigger that compiles the loops of a campaign once that is faster than to go on interpreting."""
+    """Trigger that compiles the loops of a campaign once that is faster than interpreting."""
 
     def __init__(self, stages: Sequence[StagedFunction]):
         self._loops: list[AxisLoop] = [
