@@ -14,7 +14,7 @@ from robins.filters import Code
 from robins.systems.marg import MargReplay
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL
 from robins.systems.marg.monitor import doubts_of, of_samples, sentences
-from robins.systems.marg.replay import _turned_north, true_north
+from robins.systems.marg.replay import _to_true_north, true_north
 from robins.systems.tables import SensorUpdates
 
 BLOCKS = 600
@@ -106,7 +106,7 @@ def test_north_is_true_north_where_a_place_and_a_date_are_known():
     assert found == pytest.approx(np.arctan2(east, north), abs=1e-4)
     assert np.degrees(found) < -8.0
     # a unit that points along the field points west of true north there
-    heading = 2.0 * np.arctan2(*_turned_north(np.array([[1.0, 0.0, 0.0, 0.0]]), found)[0, [3, 0]])
+    heading = 2.0 * np.arctan2(*_to_true_north(np.array([[1.0, 0.0, 0.0, 0.0]]), found)[0, [3, 0]])
     assert heading == pytest.approx(found)
     # stamps that count from the start have no date
     early = replace(fix, time_ns=np.array([0, 10**9]))

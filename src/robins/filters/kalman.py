@@ -144,7 +144,7 @@ class Filter:
         new, info = self._update(state, sensor, y, aux)
         ok = state.current | (info.code == int(Code.MISSING))
         new = select(state.current, new, state)
-        return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
+        return new, invalidated_unless(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
 
 
 class Composite(Filter):
@@ -304,7 +304,7 @@ def _failure(inputs: Data, factor: Array) -> Array:
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
 
 
-def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
+def invalidated_unless(ok: Array, info: StepInfo, why: Array) -> StepInfo:
     """Information of an update; unless `ok`, with nothing used, likelihood zero and code `why`."""
     return info._replace(
         used=info.used & ok,
@@ -418,7 +418,7 @@ class Kalman(Filter):
         squares = (block * block for block in left_out(seen)[:3])
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *squares)
         why = _failure(inputs, posterior.factor)
-        return select(ok, new, state), not_taken(ok, info, why)
+        return select(ok, new, state), invalidated_unless(ok, info, why)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, self.way.drawn(belief))

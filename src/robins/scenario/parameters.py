@@ -170,7 +170,7 @@ class Span(Parameters):
     end: Annotated[float, Quantity("time", above="0 s")]
 
     @pydantic.model_validator(mode="after")
-    def _in_order(self) -> Span:
+    def _check_order(self) -> Span:
         if self.end <= self.begin:
             raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
         return self

@@ -1,6 +1,7 @@
 """Motions for in-flight alignment: a banking aircraft, a ship in waves, a rough road.
 
-    s_turn = [Bank(0.0, 10.0), Bank(np.deg2rad(30.0), 31.0), Bank(np.deg2rad(-30.0), 30.0)]
+    right, left = np.deg2rad([30.0, -30.0])
+    s_turn = [BankedTurn(0.0, 10.0), BankedTurn(right, 31.0), BankedTurn(left, 30.0)]
     motion = fly(Geodetic.from_degrees(32.0, 118.0, 5000.0), s_turn, speed_mps=100.0)
 
 `fly` follows commanded bank angles at constant speed and height, `sail` sways about a straight

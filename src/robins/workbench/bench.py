@@ -90,7 +90,7 @@ def bench_up(
 
 
 def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> LoadedRun:
-    """Flight of a request; options that were not given stay as the scenario has them.
+    """Run requested by options; those that are not given keep the values of the scenario.
 
     Raises:
         robins.scenario.ScenarioError: there is no such scenario, or an option does not fit.

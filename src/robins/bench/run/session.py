@@ -149,7 +149,7 @@ class Session:
         with contextlib.ExitStack() as stack:
             self._recorder = self._open_record(stack)
             stack.enter_context(self.part_processes)
-            self._broker = self._wire(stack)
+            self._broker = self._connect_parts(stack)
             began = time.monotonic()
             try:
                 self.broker.gather(self.run_number, FIRST_HELLO_S)
@@ -307,7 +307,7 @@ class Session:
         recorder = Recorder(self._record_path, wire, header, topics=rows, overwrite=True)
         return stack.enter_context(recorder)
 
-    def _wire(self, stack: contextlib.ExitStack) -> Broker:
+    def _connect_parts(self, stack: contextlib.ExitStack) -> Broker:
         """Open the ports and start the processes."""
         setup = self.flight.setup
         links: dict[str, Link] = {}

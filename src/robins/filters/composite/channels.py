@@ -28,8 +28,8 @@ from robins.filters.kalman import (
     Follow,
     Prediction,
     Updated,
+    invalidated_unless,
     kalman,
-    not_taken,
 )
 from robins.filters.linearise import Transition
 from robins.filters.model import Data, Motion, Sensor, as_noise
@@ -218,7 +218,7 @@ class JoinedFilter(Composite):
         singular = jnp.stack([is_singular(m.belief) for m in members])
         ok = same | (finite(belief) & ~jnp.any(singular))
         new = FilterState(belief, joined._replace(members=members, silent=silent))
-        info = not_taken(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
+        info = invalidated_unless(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
         info = info.noted(self.title, share=jnp.mean(joined.shares[i]), silent=silent[i])
         return select(ok, new, _refused(state, singular)), info
 

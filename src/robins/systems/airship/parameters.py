@@ -66,7 +66,7 @@ class Wind(Parameters):
         return self.gusts is not None or self.turbulence is not None
 
     @pydantic.model_validator(mode="after")
-    def _steps_fit(self) -> Wind:
+    def _check_steps(self) -> Wind:
         if self.gusts is not None and self.turbulence is not None:
             steps = self.gusts.every / self.turbulence.step
             if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
@@ -173,7 +173,7 @@ class Airship(Scenario):
     believed: BelievedNoise = pydantic.Field(default_factory=BelievedNoise)
 
     @pydantic.model_validator(mode="after")
-    def _rates_fit(self) -> Airship:
+    def _check_rates(self) -> Airship:
         """Check that all measurement times fall on epochs or on even parts of one, and that all of
         it fits.
         """

@@ -56,7 +56,7 @@ class Delays(Parameters):
     time: q.Duration = default("100 s")
 
     @pydantic.model_validator(mode="after")
-    def _ordered(self) -> Delays:
+    def _check_order(self) -> Delays:
         if not self.blocked_dbhz < self.clear_dbhz:
             raise ValueError("blocked_dbhz must be less than clear_dbhz")
         return self

@@ -128,7 +128,7 @@ class GnssPath:
         out: list[tuple[int, GnssWorld]] = []
         while (due := self._due()) is not None:
             time_ns, names, rows = due
-            if self.time_ns is not None or self._begins(time_ns, names, rows):
+            if self.time_ns is not None or self._find_first_fix(time_ns, names, rows):
                 out.append((time_ns, self._step(time_ns, names, rows)))
             self._forget(time_ns)
         if self.time_ns is None and self.newest_ns is not None and self._timeout_ns < math.inf:
@@ -147,7 +147,7 @@ class GnssPath:
                 return edge_ns, [], np.zeros((0, 7))
         return self._waiting.pop(0) if ready else None
 
-    def _begins(self, time_ns: int, names: list[str], rows: np.ndarray) -> bool:
+    def _find_first_fix(self, time_ns: int, names: list[str], rows: np.ndarray) -> bool:
         """Find the first fix; False where an epoch gives none."""
         of = Counter(name[0] for name in names)
         able = sum(min(of[letter], count) for letter, count in self._channels.items())

@@ -132,8 +132,8 @@ def replay(
     answers = {name: _as_stated(log, a, parameters) for name, a in answers.items()}
     north = None if parameters.use_magnetometer == "never" else true_north(dataset)
     if north is not None:
-        q_nb = {name: _turned_north(q, north) for name, q in q_nb.items()}
-        answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
+        q_nb = {name: _to_true_north(q, north) for name, q in q_nb.items()}
+        answers = {name: _answer_to_true_north(answer, north) for name, answer in answers.items()}
     doubt = {name: _doubt(answer, seen[name], parameters) for name, answer in answers.items()}
     variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
     truth = None if dataset.attitude is None else truth_at(dataset.attitude, log.time_ns)
@@ -251,16 +251,16 @@ def true_north(dataset: Dataset) -> float | None:
     return float(elements(field).declination_rad)
 
 
-def _turned_north(q_nb: np.ndarray, declination: float) -> np.ndarray:
+def _to_true_north(q_nb: np.ndarray, declination: float) -> np.ndarray:
     """Convert attitudes (..., 4) from magnetic to true north."""
     turn = np.array([math.cos(declination / 2.0), 0.0, 0.0, math.sin(declination / 2.0)])
     return np.asarray(rotation.multiply(turn, q_nb))
 
 
-def _turned_answer(answer: FilterEstimates, declination: float) -> FilterEstimates:
+def _answer_to_true_north(answer: FilterEstimates, declination: float) -> FilterEstimates:
     turn = rotation.from_rotvec(jnp.array([0.0, 0.0, declination]))
     mean = answer.mean
-    q_nb = mean.q_nb.__class__(jnp.asarray(_turned_north(mean.q_nb.wxyz, declination)))
+    q_nb = mean.q_nb.__class__(jnp.asarray(_to_true_north(mean.q_nb.wxyz, declination)))
     turned = [np.asarray(rotation.rotate(turn, jnp.asarray(v))) for v in (mean.v_n, mean.p_n)]
     return answer._replace(mean=mean._replace(q_nb=q_nb, v_n=turned[0], p_n=turned[1]))
 

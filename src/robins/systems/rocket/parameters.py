@@ -64,7 +64,7 @@ class MagneticDisturbance(Parameters):
     length: q.Duration = default("1 s")
 
     @pydantic.model_validator(mode="after")
-    def _pauses(self) -> MagneticDisturbance:
+    def _check_pauses(self) -> MagneticDisturbance:
         if self.length >= self.every:
             raise ValueError(
                 f"length ({self.length:g} s) must be below every ({self.every:g} s), or the "
@@ -111,7 +111,7 @@ class RocketFlight(Scenario):
     start: RocketStart = pydantic.Field(default_factory=RocketStart)
 
     @pydantic.model_validator(mode="after")
-    def _long_enough(self) -> RocketFlight:
+    def _check_length(self) -> RocketFlight:
         refuse_unsettled("counted_from", self.counted_from, self.duration)
         refuse_too_long("step", self.duration, 1.0 / self.step)
         if self.duration < 2.0 * self.step:

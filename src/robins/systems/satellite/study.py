@@ -117,7 +117,7 @@ class FilterEnvironment(NamedTuple):
     attitude_rad: Array  # initial sigma
     bias_rad_s: Array
     gain: Array  # (6, 3); zeros where there is none
-    frozen: Any  # `stepwise.Frozen`, or None
+    frozen: Any  # `stepwise.FrozenPlant`, or None
 
 
 # keyed by `additive`: True for filters that add to the quaternion's components

@@ -75,7 +75,7 @@ def plan_after_command(
         plan: before the command.
         edge: at which the command was received.
         q_ib: (4,) commanded attitude; NaN: back to the course. One whose norm is not one is
-            ignored, as by `believable` for the star sensor.
+            ignored, as by `plausible_attitude` for the star sensor.
         rate: greatest rate of the slew [rad/s]; 0: half of what the wheels allow.
     """
     square = float(np.sum(q_ib * q_ib))

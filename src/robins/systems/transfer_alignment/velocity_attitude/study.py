@@ -5,11 +5,11 @@ twelve states of `velocity_attitude.model`, open loop. Scenarios disturb the mea
 outliers), the motion (gyro noise, a step of drift), both, or have mounting angles without a state.
 
 Filters assume white noise of a given variance at each time. The plain ones use the stated noise of
-sensors and master; slow gyro drift (`Slave`) is modelled as a random walk. "told-r" also knows the
-variance of flexure and outliers, but not that flexure is correlated in time, which a white R cannot
-express. "told-q" also knows the gyro noise in its window, and from the step of the drift on assumes
-a random walk that reaches the size of the step at the end. The model is linearised about the
-reports of the master.
+sensors and master; slow gyro drift (`PairSlave`) is modelled as a random walk. "told-r" also knows
+the variance of flexure and outliers, but not that flexure is correlated in time, which a white R
+cannot express. "told-q" also knows the gyro noise in its window, and from the step of the drift on
+assumes a random walk that reaches the size of the step at the end. The model is linearised about
+the reports of the master.
 """
 
 from __future__ import annotations
