@@ -115,7 +115,7 @@ def _observer(
     """The status file, and the page if it is wanted."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(status)
-        status.tell(starting_state(flight))
+        status.report(starting_state(flight))
         page = None
         if live:
             try:

@@ -124,12 +124,10 @@ def on_runs(
     read = read_scenario(name, settings)
     wanted = filter_name or read.own[0]
     (chosen,) = check_filters(read.source, read.study.filters, [wanted])
-    tuned = tuned_parameters(
-        vary, read.parameters, scenario.text_of(overridden(read.text, settings))
-    )
+    overriding = scenario.text_of(overridden(read.text, settings))
+    tuned = tuned_parameters(vary, read.parameters, overriding)
     problem = read.problem((chosen,), seed)
-    names = [b.name for b in problem.blocks]
-    by = by or ERROR
+    names, by = [b.name for b in problem.blocks], by or ERROR
     if by not in (ERROR, INNOVATIONS, *names):
         known = ", ".join([ERROR, INNOVATIONS, *names])
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
