@@ -15,7 +15,7 @@ from robins.report import figures
 from robins.results import find, read
 from robins.workbench import publish, workers
 from robins.workbench.campaign import campaign_status, campaign_work, problem_of, require_plan
-from robins.workbench.sweep import SweptParameter, report, status, sweep, varied
+from robins.workbench.sweep import SweptParameter, report, status, sweep, swept_parameter
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
@@ -41,11 +41,11 @@ def here(monkeypatch):
 
 
 def test_a_parameter_has_numbers_with_a_unit_or_names():
-    assert varied("a.b = 1 m , 2.5 m") == SweptParameter("a.b", ("1 m", "2.5 m"))
-    assert varied("a=1 m,2.5 m").coordinate == ([1.0, 2.5], "m")
-    assert varied("a=0.1,-2e3").coordinate == ([0.1, -2000.0], "1")
-    assert varied("a=1 m,1 km").coordinate == (["1 m", "1 km"], "")
-    assert varied("a=up,down").coordinate == (["up", "down"], "")
+    assert swept_parameter("a.b = 1 m , 2.5 m") == SweptParameter("a.b", ("1 m", "2.5 m"))
+    assert swept_parameter("a=1 m,2.5 m").coordinate == ([1.0, 2.5], "m")
+    assert swept_parameter("a=0.1,-2e3").coordinate == ([0.1, -2000.0], "1")
+    assert swept_parameter("a=1 m,1 km").coordinate == (["1 m", "1 km"], "")
+    assert swept_parameter("a=up,down").coordinate == (["up", "down"], "")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ BENCH, _BENCH = "bench", "vehicles part by part over serial lines, `robins bench
 
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
-    """A sentence on every system, on the bench and on design, and titles of what each can run."""
+    """Summary of every system, of the bench and of design, with the titles of what each can run."""
     entries = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
     design = "gains between H2 and H-infinity, `robins design`"
     return entries | {"bench": (_BENCH, rigs() | _benches()), "design": (design, designs())}

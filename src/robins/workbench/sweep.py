@@ -59,7 +59,7 @@ class SweptParameter(NamedTuple):
         return [number for number, _ in found], shared.pop() or "1"
 
 
-def varied(text: str) -> SweptParameter:
+def swept_parameter(text: str) -> SweptParameter:
     """Read ``key=a,b,c``.
 
     Raises:
@@ -125,7 +125,7 @@ def sweep(
         InputError, robins.scenario.ScenarioError: the request cannot be run.
         robins.errors.RobinsError: a worker failed, or the store cannot be used.
     """
-    chosen = [varied(text) for text in vary]
+    chosen = [swept_parameter(text) for text in vary]
     every = list(points(where, chosen))
     if len(chosen) not in (1, 2) or len({v.key for v in chosen}) < len(chosen):
         raise InputError("a sweep is over one parameter or two", "--vary", "give it once or twice.")
@@ -170,7 +170,7 @@ def _sweep_request(where: Where) -> tuple[list[SweptParameter], list[SweepPoint]
     sweep = sweep_of(where)
     if sweep is None:
         return None
-    chosen = [varied(text) for text in sweep[0][:2]]
+    chosen = [swept_parameter(text) for text in sweep[0][:2]]
     return chosen, list(points(where, chosen))
 
 

@@ -16,7 +16,7 @@ NICE = 5  # lower priority than the bench
 
 
 def main() -> None:
-    """Serve until the bench is gone."""
+    """Serve until the bench disconnects."""
     parser = argparse.ArgumentParser(prog="python -m robins.bench.live")
     parser.add_argument("--feed", type=int, help="file descriptor of the pipe to the bench")
     parser.add_argument("--listen", type=int, help="file descriptor of a socket that listens")

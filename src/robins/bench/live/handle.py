@@ -306,7 +306,7 @@ class LivePage(Closing):
                 self._lose()
 
     def _receive(self) -> None:
-        """Take in the lines that the server sent."""
+        """Receive the lines that the server sent."""
         while self._pipe is not None:
             try:
                 data = self._pipe.recv(4096)

@@ -104,7 +104,7 @@ class Hub:
         self._dropped = 0  # samples lost between bench and server
 
     def take(self, kind: int, body: bytes) -> None:
-        """Take a frame from the bench."""
+        """Process a frame from the bench."""
         if kind == FrameKind.SAMPLE:
             return self._take_sample(body)
         if kind == FrameKind.HISTORY:
@@ -148,7 +148,7 @@ class Hub:
             client.latest("beat", to_json(heartbeat))
 
     def end(self) -> None:
-        """Notify each page that the bench is gone."""
+        """Notify each page that the bench has disconnected."""
         self._send_all({"kind": "ended"})
 
     def _take_hello(self, greeting: JsonObject) -> None:

@@ -72,7 +72,7 @@ def application(hub: Hub, pass_on: Pass) -> Starlette:
 
 
 async def _listen(websocket: WebSocket, client: Client, hub: Hub, pass_on: Pass) -> None:
-    """Take commands until the page goes."""
+    """Receive commands until the page disconnects."""
     while True:
         message = await websocket.receive()
         if message["type"] == "websocket.disconnect":
@@ -92,7 +92,7 @@ async def _listen(websocket: WebSocket, client: Client, hub: Hub, pass_on: Pass)
 
 
 async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
-    """Serve the page until the bench is gone.
+    """Serve the page until the bench disconnects.
 
     Args:
         at: listening socket.
@@ -141,7 +141,7 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
 
 
 async def _receive_frames(reader: asyncio.StreamReader, hub: Hub) -> None:
-    """Take in the data of the bench until it is gone."""
+    """Receive the data of the bench until it disconnects."""
     with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
         while True:
             length, kind = HEAD.unpack(await reader.readexactly(HEAD.size))

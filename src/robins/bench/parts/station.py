@@ -130,7 +130,7 @@ class Station:
         return encode_frame(header, wire.encode("hello", said))
 
     def feed(self, data: bytes) -> bytes:
-        """Take received bytes and return the bytes to answer with."""
+        """Process received bytes and return the bytes to answer with."""
         answer = b""
         for frame in self._receiver.feed(data):
             answer += self._take(frame)

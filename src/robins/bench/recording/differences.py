@@ -69,7 +69,7 @@ class Differences:
         self._found: dict[tuple[str, str, int], FieldDifference] = {}
 
     def take(self, which: int, frame: Frame) -> None:
-        """Take a frame of the first run (0) or of the second (1)."""
+        """Add a frame of the first run (0) or of the second (1)."""
         key = number, time_ns = frame.header.type, frame.header.time_ns
         if number < FIRST_DATA:
             return
@@ -86,7 +86,7 @@ class Differences:
             self._differ(number, time_ns, x, y)
 
     def take_both(self, a: Frame | None, b: Frame | None) -> None:
-        """Take a frame of each run, which need not be a pair; None: the run has no more."""
+        """Add a frame of each run, which need not be a pair; None: the run has no more."""
         for which, frame in enumerate((a, b)):
             if frame is not None:
                 self.take(which, frame)

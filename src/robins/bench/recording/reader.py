@@ -184,7 +184,7 @@ class _RecordReader:
         return opcode, body
 
     def records(self) -> Iterator[None]:
-        """Take the records one by one, up to the first damage, which `why` describes."""
+        """Read the records one by one, up to the first damage, which `why` describes."""
         try:
             while self.step():
                 yield
@@ -193,7 +193,7 @@ class _RecordReader:
         yield
 
     def step(self) -> bool:
-        """Take the next record; true if there is more to come.
+        """Read the next record; true if there is more to come.
 
         Raises:
             _Damage: the file ends, or is damaged there.
@@ -209,7 +209,7 @@ class _RecordReader:
         return opcode != Opcode.DATA_END
 
     def _chunk(self, at: int, data: bytes) -> None:
-        """Take the messages of a chunk, which may be truncated."""
+        """Read the messages of a chunk, which may be truncated."""
         if len(data) < layout.CHUNK.size:
             if (
                 at + len(data) == self._at
@@ -241,7 +241,7 @@ class _RecordReader:
             place = end
 
     def _inner(self, opcode: int, data: bytes) -> None:
-        """Take a record within a chunk."""
+        """Read a record within a chunk."""
         if opcode == Opcode.SCHEMA:
             return
         if opcode == Opcode.CHANNEL:

@@ -25,7 +25,7 @@ class Orders:
     """
 
     def __init__(self, flight: LoadedRun, injector: Injector, step_ns: int):
-        """Take the faults of a run, and the operator messages of its scenario."""
+        """Set up the faults of a run and the operator messages of its scenario."""
         self.operator_events: list[OperatorEvent] = []
         self._rig, self._injector, self._step_ns = flight.rig, injector, step_ns
         self._labels: list[tuple[str, LinkFault]] = []

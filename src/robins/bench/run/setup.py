@@ -162,7 +162,6 @@ def built_in() -> dict[str, Path]:
 def read(name: str, settings: tuple[str, ...] = ()) -> LoadedRun:
     """Read a run, named by a scenario of the bench or of a system, a file of either, or a rig.
 
-
     Args:
         name: "noisy-line", "satellite/s1", "satellite" (its first), "mine.toml", "pendulum.py:rig".
         settings: changes, ``"faults.0.angle=20 deg"``; of a scenario of a system those of

@@ -19,7 +19,7 @@ class FaultSpans:
         self._ends: dict[tuple[str, float], float | None] = {}
 
     def observe(self, active: Iterable[tuple[str, float]], time_s: float) -> None:
-        """Take the faults that are active after a step.
+        """Record the faults that are active after a step.
 
         Args:
             active: label and begin [s] of each fault.

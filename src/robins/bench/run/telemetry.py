@@ -46,7 +46,7 @@ class Telemetry:
         self.series = MessageSeries(time_s, self._room.arrays)
 
     def observe(self, message: str, time_ns: int, payload: bytes) -> None:
-        """Take a message that passes."""
+        """Record a message that passes."""
         fields = self._fields.get(message)
         k = time_ns // self._step_ns - 1
         if fields is None or not 0 <= k < len(self.series.time_s):

@@ -44,7 +44,7 @@ class Receiver:
         self._too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Take bytes; return the frames that end in them."""
+        """Process bytes; return the frames that end in them."""
         found: list[Frame] = []
         *ended, rest = bytes(data).split(EDGE)
         for piece in ended:

@@ -194,7 +194,7 @@ class LiveGnss(Live):
         """Process a sample of wheels and yaw gyro; return the state at its stamp.
 
         Args:
-            time_ns: stamp, whole nanoseconds, of the clock that epochs have too.
+            time_ns: stamp, whole nanoseconds, of the clock that the epochs share.
             speed_mps: forward.
             yaw_rate: rad/s, positive to the right.
             sigma_speed: m/s, noise of the sample.

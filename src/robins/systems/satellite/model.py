@@ -140,7 +140,7 @@ def _noise_of_frame(x: AttitudeState | QuaternionState, factor: Array) -> Array:
 def model(
     noise: GyroNoiseModel, star_rad: Listed, additive: bool = False, of_frame: bool = False
 ) -> Model:
-    """Motion and star sensor, whose noise each frame may bring with it."""
+    """Motion and star sensor, whose noise may be stated by each frame."""
     sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:
         moves = Motion(Partial(_move_additive, noise), Partial(_noise_additive, noise))
