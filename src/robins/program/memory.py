@@ -43,7 +43,7 @@ class Reader:
     """Reader of a pytree from its slots in memory."""
 
     def __init__(self, result_slots: list[MemorySlot], tree: Tree):
-        """Take slots, and the structure whose leaves they are."""
+        """Set up a reader for slots and the structure whose leaves they hold."""
         self._tree = tree
         self._blank = [None] * len(result_slots)
         self._arrays = [
@@ -104,7 +104,7 @@ class _Call(NamedTuple):
     end: tuple[int, int]  # behind it
     result: Reader  # of the result, counted from there
 
-    def takes(self, leaves: list[ArrayLike], tree: Tree) -> bool:
+    def matches(self, leaves: list[ArrayLike], tree: Tree) -> bool:
         """True if it was traced for arguments like these."""
         return tree == self.tree and all(map(_alike, leaves, self.forms))
 
@@ -203,7 +203,7 @@ class NativeState:
         """
         leaves, tree = jax.tree_util.tree_flatten(args)
         call = self._calls.get(name)
-        if call is None or not call.takes(leaves, tree):
+        if call is None or not call.matches(leaves, tree):
             call = self._calls[name] = self._call(name, function, args, leaves, tree)
         for view, leaf in zip(call.views, leaves, strict=True):
             view[...] = leaf

@@ -219,7 +219,7 @@ def _vectors(name: str, value: _arguments.Listed, count: int) -> Array:
 
 
 def _sigma(sigma_t: Number, count: int) -> Array:
-    """(E, 3) or (1, 3)."""
+    """Standard deviations (E, 3) or (1, 3) [T]."""
     sigma = jnp.asarray(sigma_t, float)
     if sigma.shape in ((), (3,)):
         return _arguments.vector("sigma_t", sigma_t, 3, low=0.0)[None]

@@ -85,7 +85,7 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
     sentences = []
     for suspect, chance in wrong.items():
         chance = np.asarray(chance, float)
-        held = [(a, b) for a, b in edges(chance > HELD) if not _as_begun(chance, a, b)]
+        held = [(a, b) for a, b in edges(chance > HELD) if not _begins_unsure(chance, a, b)]
         if held:
             found = [(float(time_s[a]), float(time_s[b - 1])) for a, b in held]
             most = max(float(np.max(chance[a:b])) for a, b in held)
@@ -99,7 +99,7 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
     return sentences
 
 
-def _as_begun(chance: np.ndarray, begin: int, end: int) -> bool:
+def _begins_unsure(chance: np.ndarray, begin: int, end: int) -> bool:
     """True if epochs begin:end open a piece of the log, unsure, and never rise above the first."""
     opens = begin == 0 or np.isnan(chance[begin - 1])
     return bool(opens and np.max(chance[begin:end]) <= chance[begin] < SURE)

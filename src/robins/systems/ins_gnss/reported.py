@@ -69,7 +69,7 @@ def _antenna(mount: model.Mount, row: tuple[InsState, Array]) -> tuple[model.Mou
     return mount, model.read_position(mount, *row)
 
 
-def _between(places: tuple[Geodetic, Geodetic]) -> Array:
+def _displacement(places: tuple[Geodetic, Geodetic]) -> Array:
     """Displacement (3,) [m, NED] from one position to another."""
     return places[0].local(places[1])
 
@@ -90,7 +90,7 @@ def distances(
     epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
     at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
     fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
-    error, withheld = mapped_rows(_between, (fix, at)), log.withheld[use]
+    error, withheld = mapped_rows(_displacement, (fix, at)), log.withheld[use]
     across = np.hypot(error[:, 0], error[:, 1])
     out: dict[str, Any] = {
         "aided_horizontal_rms_m": _rms(across[~withheld]),
@@ -153,7 +153,7 @@ def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: li
     parts.append(f"{refused} of {count} fixes refused")
     far = 0.0
     if (smooth := answers.get(f"{name}+rts")) is not None:
-        apart = mapped_rows(_between, (answers[name].mean.position, smooth.mean.position))
+        apart = mapped_rows(_displacement, (answers[name].mean.position, smooth.mean.position))
         far = float(np.nanmax(np.abs(apart) / np.asarray(answers[name].sigma)[:, 6:9]))
         parts.append(f"at most {far:.1f} sigmas away from the smoothed path")
     own = [one for one in doubts if one.startswith(f"{name}: ")]
