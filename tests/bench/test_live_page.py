@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from browsing import a_browser, browse
 from playwright.sync_api import expect
+from reused_page import ReusedPage
 
 from robins.bench.live import LivePage, Signal
 
@@ -55,14 +56,14 @@ def chromium():
 
 @pytest.fixture(scope="module")
 def server():
-    with LivePage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as made:
+    with ReusedPage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as made:
         yield made
 
 
 @pytest.fixture
 def live(server):
     """A server as new; the run differs from test to test."""
-    server.new_run(server.run + 1)
+    server.next_run()
     server.commands()
     return server
 
@@ -206,7 +207,7 @@ def test_a_new_run_clears_plots_and_events(chromium, live):
         push(live, page, 30)
         live.event("alarm", 1.0, "old")
         expect(page.get_by_test_id("alarm")).to_contain_text("old")
-        live.new_run(live.run + 1)
+        live.next_run()
         expect(page.get_by_test_id("run")).to_have_text(str(live.run))
         assert page.evaluate("[bench.shown, bench.plots[0].chart.data[0].length]") == [0, 0]
         expect(page.get_by_test_id("alarm")).to_have_text("no alarm")
@@ -260,7 +261,7 @@ def test_health_of_the_bench_is_told(chromium, live):
 
 
 def test_a_killed_server_is_noticed_and_its_return_too(chromium):
-    with LivePage(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
+    with ReusedPage(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
         expect(page.locator(".plot")).to_have_count(5)
         push(live, page, 20)
         state(page, "live", 1.0)
@@ -388,7 +389,7 @@ def test_a_fault_is_injected_with_the_keyboard_alone(chromium, live):
 
 def test_a_chosen_fault_stays_chosen_when_the_server_returns(chromium):
     with (
-        LivePage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as live,
+        ReusedPage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as live,
         browse(chromium, live.url) as page,
     ):
         page.get_by_test_id("fault").select_option("gyro noise")

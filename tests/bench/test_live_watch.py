@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from browsing import a_browser, browse, installed
 from playwright.sync_api import expect
+from reused_page import ReusedPage
 from scipy.spatial.transform import Rotation
 
 from robins.bench.live import LivePage, Signal
@@ -30,13 +31,13 @@ def chromium():
 
 @pytest.fixture(scope="module")
 def server():
-    with LivePage(SIGNALS, "a long run", 1, faults=FAULTS) as made:
+    with ReusedPage(SIGNALS, "a long run", 1, faults=FAULTS) as made:
         yield made
 
 
 @pytest.fixture
 def live(server):
-    server.new_run(server.run + 1)
+    server.next_run()
     server.commands()
     return server
 
@@ -89,7 +90,7 @@ def test_a_late_page_sees_the_whole_run_and_its_spike(chromium, live):
 
 
 def test_a_page_that_was_away_for_long_gets_what_it_missed(chromium):
-    with LivePage(SIGNALS, "a long run", 1) as live, browse(chromium, live.url) as page:
+    with ReusedPage(SIGNALS, "a long run", 1) as live, browse(chromium, live.url) as page:
         push(live, 0, 400)
         reached(page, 20.0)
         os.kill(live._process.pid, signal.SIGKILL)
@@ -121,7 +122,7 @@ def a_day(signals: int) -> bytes:
 def test_a_day_of_forty_signals_is_light_for_the_page(chromium):
     """The page shows all of it, goes on, and no picture takes long."""
     signals = [Signal(f"s{k}", "m", f"plot {k // 4}") for k in range(40)]
-    with LivePage(signals, "a day", 1) as live:
+    with ReusedPage(signals, "a day", 1) as live:
         live._history = SampleHistory.unpack(a_day(40))
         live.restart()
         with browse(chromium, live.url) as page:

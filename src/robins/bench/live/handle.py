@@ -150,24 +150,6 @@ class LivePage(Closing):
         self._lines.append(feed.to_json(self._events.add(level, time_s, text)).encode())
         self._pump()
 
-    def new_run(self, run: int) -> None:
-        """Begin another run on the same page: its plots and events are cleared.
-
-        Raises:
-            ValueError: it is the run already shown; pages could not tell the two apart.
-        """
-        if run == self.run:
-            raise ValueError(f"run {run} is shown already; another run has another number")
-        self.run = run
-        self._sequence = 0
-        for old in (self._recent, self._samples, self._lines, self._commands):
-            old.clear()
-        self._history, self._before = SampleHistory(len(self._signals)), b""
-        self._events.kept.clear()
-        self._last_status = self._status = None
-        self._hello = self._make_hello()
-        self._pump()
-
     # ---------------------------------------------------------------------- from page to bench
 
     def commands(self) -> list[JsonObject]:
@@ -202,19 +184,6 @@ class LivePage(Closing):
             self.restarts += 1
             self._start()
             self._pump()
-
-    def restart(self) -> None:
-        """Start the server again at the same port and wait until it listens.
-
-        Raises:
-            RuntimeError: the server does not start, or the page is closed.
-        """
-        if self._closed:
-            raise RuntimeError("the live page is closed")
-        self._end(kill=True)
-        self.restarts += 1
-        self._start()
-        self._wait_until_it_listens()
 
     def close(self) -> None:
         """End the server after it has shown the last samples and events. May be repeated."""
