@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import made_logs
 import numpy as np
 import pytest
 from made_logs import found, rows_of, with_gnss, with_imu
@@ -156,6 +157,20 @@ def test_a_straight_drive_of_rough_positions_is_sound(noise_m):
         imu.time_ns[::50], *place, 500.0 + off[:, 2], np.full((60, 3), np.nan), source="fixes.csv"
     )
     assert [f for f in examine(Dataset("straight", imu, fixes)) if f.severity != "note"] == []
+
+
+def circle(t):
+    """Motion of 12 s at rest, 10 s of taking up 6 m/s, then laps of a circle of 20 m."""
+    s = np.clip((t - 12.0) / 10.0, 0.0, 1.0)
+    way = 6.0 * (10.0 * (s**3 - 0.5 * s**4) + np.maximum(t - 22.0, 0.0))
+    return 6.0 * s**2 * (3.0 - 2.0 * s), 0.0 * t, 0.0 * t, 0.4 + way / 20.0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_circle_at_constant_speed_is_no_rest(monkeypatch, seed):
+    """Rate and specific force are steady as at rest, and each lap is like the last."""
+    monkeypatch.setattr(made_logs, "motion", circle)
+    assert errors(made_logs.make_drive(seed)) == []
 
 
 def test_axes_that_were_hardly_turned_keep_their_names():

@@ -44,6 +44,7 @@ _RATES = np.arange(-0.02, 0.0201, 0.0005)
 _PART = 5.0  # log-likelihood that each part with an own offset must gain
 _PROMISING = {"clock": 3, "scale": 1, "gyros": 2, "forces": 1}  # starts from which a fit is tried
 _ROUNDS = 14
+_LEAST_REST_S = 3.0
 _LEAST_SHARE = 1e-4  # unexplained share below which no block is freed
 
 
@@ -91,21 +92,26 @@ def _at_rest(signal: ImuSignal, track: FixTrack) -> tuple[ImuSignal | None, floa
     size, bias = usual_force(windows), np.zeros(3)
     if not size > 0.0:
         return None, 1.0
-    # a steady turn in flight looks like rest to an IMU, not to a receiver
-    if windows.at_rest.any() and _stood(track):
-        bias = np.median(windows.gyro[windows.at_rest], axis=0)
+    # A steady turn looks like rest to an IMU, not to a receiver, whose clock may be off: the
+    # windows of least rate are taken for as long as it stood.
+    stood_s, window_s = _stood_s(track), float(np.diff(signal.time_s[windows.first[:2]]).sum())
+    if windows.at_rest.any() and stood_s > _LEAST_REST_S:
+        gyro = windows.gyro[windows.at_rest]
+        slowest = np.argsort(np.linalg.norm(gyro, axis=1))
+        count = len(gyro) if window_s == 0.0 else max(1, round(stood_s / window_s))
+        bias = np.median(gyro[slowest[:count]], axis=0)
     off = size / GRAVITY
     factor = 1.0 if 0.8 < off < 1.25 else 1.0 / off
     return signal._replace(accel=signal.accel * factor, gyro=signal.gyro - bias), factor
 
 
-def _stood(track: FixTrack) -> bool:
-    """True if, by the fixes, the vehicle stood for three seconds."""
+def _stood_s(track: FixTrack) -> float:
+    """Time for which, by the fixes, the vehicle stood [s]."""
     step = np.diff(track.time_s)
     moved = np.diff(track.r_n, axis=0) / step[:, None]
     v = moved if track.v_n is None else track.v_n[1:]
     slow = np.hypot(v[:, 0], v[:, 1]) < 0.3 + (2.0 * track.sigma_m if track.v_n is None else 0.0)
-    return float(np.sum(step[slow])) > 3.0
+    return float(np.sum(step[slow]))
 
 
 def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str]:
