@@ -106,12 +106,19 @@ def _at_rest(signal: ImuSignal, track: FixTrack) -> tuple[ImuSignal | None, floa
 
 
 def _stood_s(track: FixTrack) -> float:
-    """Time for which, by the fixes, the vehicle stood [s]."""
-    step = np.diff(track.time_s)
-    moved = np.diff(track.r_n, axis=0) / step[:, None]
-    v = moved if track.v_n is None else track.v_n[1:]
-    slow = np.hypot(v[:, 0], v[:, 1]) < 0.3 + (2.0 * track.sigma_m if track.v_n is None else 0.0)
-    return float(np.sum(step[slow]))
+    """Time for which, by the fixes, the vehicle stood [s].
+
+    Positions are compared over three seconds, or over what makes their noise less than 0.6 m/s.
+    """
+    time_s, v, least = track.time_s, track.v_n, 0.3
+    step = np.diff(time_s)
+    if v is None:
+        span = max(_LEAST_REST_S, 5.0 * track.sigma_m)
+        stride = max(1, round(span / float(np.median(step))))
+        over, least = time_s[stride:] - time_s[:-stride], 0.3 + 3.0 * track.sigma_m / span
+        v = (track.r_n[stride:] - track.r_n[:-stride]) / over[:, None]
+    slow = np.hypot(v[1:, 0], v[1:, 1]) < least
+    return float(np.sum(step[: len(slow)][slow]))
 
 
 def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str]:
