@@ -154,8 +154,13 @@ def explained(verdict: ModelChoice) -> bool:
 
 
 def in_body(verdict: ModelChoice) -> np.ndarray:
-    """Velocities (k, 3) [m/s] above 0.5 m/s, in the axes of the IMU."""
+    """Velocities (k, 3) [m/s] above 0.5 m/s, in the axes of the IMU.
+
+    None, (0, 3), if the azimuth of the axes is not observed: in a steady turn small biases turn it.
+    """
     views, one = verdict.views, verdict.fit
+    if one.azimuth > _SURE:
+        return np.zeros((0, 3))
     seen = np.zeros(len(views.v), bool)
     seen[views.node] = np.isfinite(one.squares)
     C = one.R[views.node_of] @ one.turned
@@ -175,7 +180,8 @@ def travel(verdict: ModelChoice) -> tuple[float, float] | None:
     parts = np.array_split(np.angle(ahead / mean), min(len(verdict.views.start_s), 8))
     each = np.array([np.mean(part) for part in parts])
     spread = float(np.std(each))  # of crab and slip, which last: more parts do not average them
-    return float(np.rad2deg(np.angle(mean))), float(np.rad2deg(max(spread, 0.005)))
+    sigma = np.hypot(max(spread, 0.005), verdict.fit.azimuth)
+    return float(np.rad2deg(np.angle(mean))), float(np.rad2deg(sigma))
 
 
 def _nearest(M: np.ndarray) -> np.ndarray:

@@ -70,8 +70,9 @@ class MotionFit(NamedTuple):
     sigma: np.ndarray  # (parameters,) one sigma; relative for the matrices
     R: np.ndarray  # (stretches, 3, 3) from the first axes of each to those of its velocities
     squares: np.ndarray  # (k,) residual square of each change of velocity; NaN without IMU
-    turned: np.ndarray  # (nodes, 3, 3) attitude C at each node
+    turned: np.ndarray  # (nodes, 3, 3) attitude C in the middle of each node
     strain: float = 0.0  # chi-square of the parameters relative to their prior
+    azimuth: float = 0.0  # rad, one sigma of what the parameters turn all R about the vertical
 
     def left(self, views: MotionIntegrals) -> float:
         """Unexplained share of the change of velocity; infinite without IMU."""
@@ -118,7 +119,7 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
 
     Returns:
         u: (k, 3, 1 + parameters) in the first axes of the stretch.
-        C: (nodes, 3, 3) attitudes.
+        C: (nodes, 3, 3) attitudes in the middle of each node.
         seen: (k,) bool, changes for which the IMU was recorded.
     """
     n_fine = int(np.ceil((views.length_s * (1 + abs(state.rate)) + 2 * _PAD_S) * RATE_HZ))
@@ -159,7 +160,8 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
     last = np.zeros(len(all_))
     np.maximum.at(last, views.node_of, end)
     seen = _recorded(views, first + _PAD_S, first + last / RATE_HZ)[views.of]
-    return u[views.node + views.stride] - u[views.node], C_end, seen
+    C_middle = at(0.5 * (begin + end), C)
+    return u[views.node + views.stride] - u[views.node], C_middle, seen
 
 
 def _sampled(stretch: np.ndarray, index: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -308,7 +310,7 @@ def _step(
     squares = np.sum(rest**2, axis=1)
     usual = max(np.sqrt(np.nanmedian(squares) / 2.37), 1e-6) if recorded.any() else np.nan
     weight = 1.0 / (1.0 + squares / (3.0 * (_ROBUST * usual) ** 2))
-    H, g, scores = np.zeros((count, count)), np.zeros(count), []
+    H, g, scores, along = np.zeros((count, count)), np.zeros(count), [], []
     for s, k in enumerate(rows):
         if len(k):
             A = (R[s] @ u[k, :, 1:]).reshape(-1, count)
@@ -316,7 +318,10 @@ def _step(
             w, r = np.repeat(weight[k], 3), rest[k].ravel()
             # what a rotation of the stretch explains is no evidence for other parameters
             inside = B.T @ (w[:, None] * B) + 1e-9 * np.eye(3)
-            A = A - B @ np.linalg.solve(inside, B.T @ (w[:, None] * A))
+            turn = np.linalg.solve(inside, B.T @ (w[:, None] * A))
+            up = np.mean(views.gained[k], axis=0)
+            along.append(up @ turn / np.linalg.norm(up))
+            A = A - B @ turn
             r = r - B @ np.linalg.solve(inside, B.T @ (w * r))
             H += A.T @ (w[:, None] * A)
             scores.append(A.T @ (w * r))
@@ -330,9 +335,12 @@ def _step(
     step = inverse @ (g / variance - expected @ moved)
     meat = np.array(scores).T @ np.array(scores) if scores else np.zeros_like(H)
     meat *= len(scores) / max(len(scores) - 1, 1) / variance**2
-    spread = np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse))
+    both = inverse, inverse @ meat @ inverse
+    spread = np.max([np.diag(P) for P in both], axis=0)
+    turn = np.mean(along, axis=0) if along else np.zeros(count)
+    azimuth = float(np.sqrt(max(turn @ P @ turn for P in both)))
     strain = float(moved @ expected @ moved)
-    return MotionFit(state, np.sqrt(spread), R, squares, C, strain), step
+    return MotionFit(state, np.sqrt(spread), R, squares, C, strain, azimuth), step
 
 
 def prior_of(parts: int = 1, *free: str) -> np.ndarray:
