@@ -177,7 +177,7 @@ def test_a_bias_on_a_circle_is_no_direction_of_travel(monkeypatch):
     """At constant speed a bias ahead and the pull of the circle are one steady force."""
     monkeypatch.setattr(made_logs, "motion", lambda t: circle(t + 60.0))
     drive = made_logs.make_drive()
-    assert errors(with_imu(drive, accel=drive.imu.accel + [0.5, 0.0, 0.0])) == []
+    assert errors(with_imu(drive, accel=drive.imu.accel + np.array([0.5, 0, 0]))) == []
 
 
 def test_axes_that_were_hardly_turned_keep_their_names():
