@@ -96,6 +96,7 @@ def truth_of(rng, kind, seconds, rate):
         return np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1])) / rate])
 
     h = rng.uniform(0, 2000) - summed(v[:, 2])
+    h += max(0.0, -float(h.min()))  # no flight is below the sea
     lat = np.full_like(t, lat0)
     for _ in range(3):
         w = 1 - E2 * np.sin(lat) ** 2
