@@ -1,6 +1,7 @@
 """The doctor on sensors that share a motion, and its manners."""
 
 import dataclasses
+import re
 
 import made_logs
 import numpy as np
@@ -178,6 +179,18 @@ def test_a_bias_on_a_circle_is_no_direction_of_travel(monkeypatch):
     monkeypatch.setattr(made_logs, "motion", lambda t: circle(t + 60.0))
     drive = made_logs.make_drive()
     assert errors(with_imu(drive, accel=drive.imu.accel + np.array([0.5, 0, 0]))) == []
+
+
+def test_a_step_in_an_outage_is_no_drift(drive):
+    """A clock set by half a second while there was no fix may have drifted as well."""
+    t = (drive.gnss.time_ns - drive.gnss.time_ns[0]) * 1e-9
+    gnss = rows_of(drive.gnss, (t < 27.0) | (t > 50.0))
+    after = gnss.time_ns > gnss.time_ns[0] + 40_000_000_000
+    gnss = dataclasses.replace(gnss, time_ns=gnss.time_ns + 500_000_000 * after)
+    (f,) = errors(dataclasses.replace(drive, gnss=gnss))
+    assert f.code == "motion_disagrees"
+    assert f.value == pytest.approx(-0.5, abs=0.1)
+    assert re.search("a drift of -[89].* ms in a second explain it about equally", f.sentence)
 
 
 def test_axes_that_were_hardly_turned_keep_their_names():

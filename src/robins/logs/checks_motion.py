@@ -13,8 +13,8 @@ import numpy as np
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.findings import Finding
 from robins.logs.gnss_motion import track_of
-from robins.logs.motion import power_of, signed_permutations
-from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE
+from robins.logs.motion import MotionIntegrals, power_of, signed_permutations
+from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE, MotionFit
 from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import (
     error,
@@ -314,24 +314,47 @@ def _forces(imu: ImuTable, found: dict, share: str) -> list[Finding]:
     ]
 
 
+def _steps(one: MotionFit, views: MotionIntegrals) -> list[tuple[float, float, float]]:
+    """Steps of the clock of fixes that count: size and sigma [s], and when [s]."""
+    sigma, out = np.maximum(one.sigma[OFFSET:], _LEAST_S), []
+    for k, size in enumerate(np.diff(one.state.offset)):
+        s = float(np.hypot(sigma[k], sigma[k + 1]))
+        if abs(size) > max(_OFFSET_S, _SIGMAS * s):
+            out.append((float(size), s, float(views.start_s[np.argmax(one.state.part == k + 1)])))
+    return out
+
+
+def _drifts(one: MotionFit, views: MotionIntegrals) -> bool:
+    """True if the rate of the clock of fixes counts."""
+    rate, span = abs(one.state.rate), float(views.end_s[-1] - views.begin_s[0])
+    return bool(rate > _SIGMAS * one.sigma[RATE] and rate * span > _DRIFT_S)
+
+
 def _clock(
     imu: ImuTable, gnss: GnssTable, verdict: ModelChoice, found: dict, share: str
 ) -> Iterator[Finding]:
     """Findings about the clocks: steps, rate, offset."""
-    state, views = verdict.fit.state, verdict.views
-    sigma = np.maximum(verdict.fit.sigma[OFFSET:], _LEAST_S)
-    for k, size in enumerate(np.diff(state.offset)):
-        s = float(np.hypot(sigma[k], sigma[k + 1]))
-        if abs(size) > max(_OFFSET_S, _SIGMAS * s):
-            when = float(views.start_s[np.argmax(state.part == k + 1)])
-            yield error(gnss, "time_jump", float(size))(
-                f"the motion fits {name_of(imu)} only if {size:+.2f} +- {s:.2f} s is added to all "
-                f"stamps from about {when:.0f} s after the start of {name_of(imu)} on {share}. "
-                f"{_step_named(size, s) or 'A clock was set there'}; take the step off."
-            )
+    views, other = verdict.views, verdict.other
+    steps, drifts = _steps(verdict.fit, views), _drifts(verdict.fit, views)
     rate, s = found["rate"]
-    span = float(views.end_s[-1] - views.begin_s[0])
-    if abs(rate) > _SIGMAS * s and abs(rate) * span > _DRIFT_S:
+    if other is not None and (
+        (drifts and _steps(other, views)) or (steps and _drifts(other, views))
+    ):
+        stepped, drifting = (other, verdict.fit) if drifts else (verdict.fit, other)
+        size, _, when = max(_steps(stepped, views), key=lambda step: abs(step[0]))
+        yield warning(gnss, "motion_disagrees", size)(
+            f"the motion fits {name_of(imu)} only with other stamps {share}; a step of {size:+.2f} "
+            f"s from about {when:.0f} s on and a drift of {1e3 * drifting.state.rate:+.3g} ms in a "
+            "second explain it about equally. Drive more turns and stops to tell which."
+        )
+        return
+    for size, of_step, when in steps:
+        yield error(gnss, "time_jump", size)(
+            f"the motion fits {name_of(imu)} only if {size:+.2f} +- {of_step:.2f} s is added to "
+            f"all stamps from about {when:.0f} s after the start of {name_of(imu)} on {share}. "
+            f"{_step_named(size, of_step) or 'A clock was set there'}; take the step off."
+        )
+    if drifts:
         yield error(gnss, "clock_rate", rate)(
             f"its clock and that of {name_of(imu)} drift apart by {1e3 * rate:+.3g} +- "
             f"{1e3 * s:.2g} ms in a second {share}. Stamp both by one clock, or stretch the stamps "

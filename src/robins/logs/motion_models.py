@@ -57,6 +57,7 @@ class ModelChoice(NamedTuple):
     fit: MotionFit  # with the free blocks
     free: tuple[str, ...]  # "clock", "gyros", "forces", by decreasing improvement
     rival: str  # a block that fits nearly as well as the first, or ""
+    other: MotionFit | None  # with steps of the clock for its rate, if about as good, or vice versa
     factor: float  # applied to specific forces beforehand, from gravity
 
 
@@ -121,16 +122,19 @@ def _stood_s(track: FixTrack) -> float:
     return float(np.sum(step[: len(slow)][slow]))
 
 
-def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str]:
-    """Fits of `ModelChoice`, the free blocks, and the rival of the first."""
+def choose(
+    views: MotionIntegrals,
+) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str, MotionFit | None]:
+    """Fits of `ModelChoice`, the free blocks, the rival of the first, and the other clock."""
     nothing = fit(views, start_of(views), prior_of())
-    best, clocked, free, rival = nothing, nothing, (), ""
+    best, clocked, free, rival, other = nothing, nothing, (), "", None
     for _ in range(2):
-        fits = {
+        found = {
             block: _freed(views, block, best, free)
             for block in _BLOCKS
             if not {block, *(("scale",) if block == "gyros" else ())} <= {*free}
         }
+        fits = {block: one for block, (one, _) in found.items()}
         clocked = clocked if free else fits["clock"]
         gain = {b: _gain(views, best, f) - _COST[b] for b, f in fits.items()}
         order = sorted(gain, key=lambda b: -gain[b])
@@ -140,14 +144,20 @@ def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tup
         others = [b for b in order[1:] if not {b, first} <= {"scale", "gyros"}]
         if not free and gain[others[0]] > gain[first] - _CLEAR:
             rival = others[0]
+        other = found[first][1] if first == "clock" else other
         best, free = fits[first], (*free, first)
         if best.left(views) * float(np.mean(power_of(views))) < _NOISY * views.noise**2:
             break  # everything is explained
-    return nothing, clocked, best, free, rival
+    return nothing, clocked, best, free, rival, other
 
 
-def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]) -> MotionFit:
-    """A model with one more block, from the best fit so far or from the most promising start."""
+def _freed(
+    views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]
+) -> tuple[MotionFit, MotionFit | None]:
+    """A model with one more block, from the best fit so far or from the most promising start.
+
+    And, if a clock with a rate and one with steps are about as good, that of the other kind.
+    """
     known, starts = _starts(views, block, best, free)
 
     def fitted(start: PairState, rounds: int, begin: PairState | None = None) -> MotionFit:
@@ -162,7 +172,11 @@ def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str,
         different = np.unique(np.round(seen, 6), return_index=True)[1]
         starts = [starts[k] for k in different[-_PROMISING[block] :]]
     fits = [fitted(known, _ROUNDS, best.state), *(fitted(start, _ROUNDS) for start in starts)]
-    return fits[int(np.argmax([_gain(views, best, one) for one in fits]))]
+    gains = np.array([_gain(views, best, one) for one in fits])
+    steps = np.array([len(one.state.offset) > 1 for one in fits])
+    k = int(np.argmax(gains))
+    others = np.flatnonzero((steps != steps[k]) & (gains > gains[k] - _CLEAR))
+    return fits[k], fits[others[np.argmax(gains[others])]] if len(others) else None
 
 
 def _gain(views: MotionIntegrals, before: MotionFit, after: MotionFit) -> float:
