@@ -67,8 +67,7 @@ def _turning(
                 f"{shown}, but they do ({left:.0%}) if the quaternions are {words}."
             )
             return
-    maps = signed_permutations()
-    maps = maps[np.linalg.det(maps) > 0.0]
+    maps = signed_permutations(proper=True)
     left = _left_over(steps, time_s, q, maps)
     k = int(np.argmin(left))
     if left[k] < good:

@@ -226,8 +226,7 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
     steps = steps_of(signal, time_s)
     if other or steps is None:
         return
-    maps = signed_permutations()
-    maps = maps[np.linalg.det(maps) > 0.0]
+    maps = signed_permutations(proper=True)
     left = _left_over(time_s, field, steps, maps)
     k = int(np.argmin(left))
     if left[0] < _WRONG or left[k] > min(_RIGHT, _BETTER * left[0]):

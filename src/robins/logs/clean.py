@@ -14,7 +14,7 @@ of order are refused.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ from robins.logs.limits import (
     SPEED_LIMIT,
 )
 from robins.logs.ordering import Rows, refusals, rows_where
-from robins.logs.tables import TOLERANCE, checked, place_of
+from robins.logs.tables import TOLERANCE, AnyTable, checked, place_of
 
 _PLACEHOLDER_SIGMA = 1.0
 _PLACE_LIMIT = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
@@ -108,8 +108,7 @@ def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     v_n = np.where(np.isnan(truth.v_n), 0.0, truth.v_n)
     values = np.hstack([place_of(truth), v_n, truth.q_nb])
     limit = np.array([*_PLACE_LIMIT, *[SPEED_LIMIT] * 3, *[QUATERNION_LIMIT] * 4])
-    keep, counts = refusals("truth", truth.time_ns, *_whole_rows(values, limit))
-    return rows_where(truth, keep), counts
+    return _kept("truth", truth, *_whole_rows(values, limit))
 
 
 def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
@@ -132,10 +131,8 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
         bad = {reason: rows | bad.get(reason, rows) for reason, rows in more.items()}
     kept["q_nb"][np.isnan(kept["q_nb"]).any(axis=1)] = np.nan
     have = np.any([np.isfinite(values).any(axis=1) for values in kept.values()], axis=0)
-    keep, counts = refusals("master", master.time_ns, have, bad)
     lat, lon, alt = kept.pop("place").T
-    table = dataclasses.replace(master, lat_rad=lat, lon_rad=lon, alt_m=alt, **kept)
-    return rows_where(table, keep), counts
+    return _kept("master", master, have, bad, lat_rad=lat, lon_rad=lon, alt_m=alt, **kept)
 
 
 def _with_sigmas(gnss: GnssTable, findings: list[Finding]) -> GnssTable:
@@ -160,16 +157,22 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
     gnss = checked(gnss)
     place, sigma_m, bad = _components(place_of(gnss), gnss.sigma_m, _PLACE_LIMIT)
     have = np.isfinite(place).any(axis=1)
-    lat, lon, alt = place.T
-    kept = {"lat_rad": lat, "lon_rad": lon, "alt_m": alt, "sigma_m": sigma_m}
+    kept = dict(zip(("lat_rad", "lon_rad", "alt_m"), place.T, strict=True)) | {"sigma_m": sigma_m}
     if gnss.v_n is not None and gnss.sigma_v is not None:
         limit = np.full(3, SPEED_LIMIT)
         v_n, sigma_v, more = _components(gnss.v_n, gnss.sigma_v, limit)
         bad = {reason: bad[reason] | more[reason] for reason in bad}
         have |= np.isfinite(v_n).any(axis=1)
         kept |= {"v_n": v_n, "sigma_v": sigma_v}
-    keep, counts = refusals("gnss", gnss.time_ns, have, bad)
-    return rows_where(dataclasses.replace(gnss, **kept), keep), counts
+    return _kept("gnss", gnss, have, bad, **kept)
+
+
+def _kept(
+    name: str, table: AnyTable, have: Rows, bad: Mapping[str, Rows], **columns: np.ndarray
+) -> tuple[AnyTable, dict[str, int]]:
+    """Rows of a table that are not refused, with other columns, and the counts by reason."""
+    keep, counts = refusals(name, table.time_ns, have, bad)
+    return rows_where(dataclasses.replace(table, **columns), keep), counts
 
 
 def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, Rows]]:
@@ -239,9 +242,8 @@ def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
     read = checked(mag)
     mag = spread(read)
     field_t, bad = _numbers(mag.field_t, FIELD_LIMIT_T)
-    keep, counts = refusals("mag", mag.time_ns, np.ones(len(mag), bool), bad)
-    counts |= spread_counts("mag", read, mag)
-    return rows_where(dataclasses.replace(mag, field_t=field_t), keep), counts
+    table, counts = _kept("mag", mag, np.ones(len(mag), bool), bad, field_t=field_t)
+    return table, counts | spread_counts("mag", read, mag)
 
 
 def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, int]]:
@@ -259,8 +261,7 @@ def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, in
         wrong = ~(np.abs(np.linalg.norm(q_nb, axis=1) - 1.0) < TOLERANCE) & ~nan & ~inf
     q_nb = np.where((nan | inf | wrong)[:, None], np.nan, q_nb)
     bad = {"nan": nan & ~inf, "inf": inf, "absurd": wrong}
-    keep, counts = refusals("attitude", attitude.time_ns, np.ones(len(attitude), bool), bad)
-    return rows_where(dataclasses.replace(attitude, q_nb=q_nb), keep), counts
+    return _kept("attitude", attitude, np.ones(len(attitude), bool), bad, q_nb=q_nb)
 
 
 def clean_odometry(odometry: OdometryTable) -> tuple[OdometryTable, dict[str, int]]:
@@ -274,8 +275,7 @@ def clean_odometry(odometry: OdometryTable) -> tuple[OdometryTable, dict[str, in
     limit = np.array([SPEED_LIMIT, SIGMA_LIMIT])
     have, bad = _whole_rows(np.stack([odometry.speed_mps, sigma], axis=-1), limit)
     bad["sigma"] = have & (sigma <= 0.0)
-    keep, counts = refusals("odometry", odometry.time_ns, have & (sigma > 0.0), bad)
-    return rows_where(odometry, keep), counts
+    return _kept("odometry", odometry, have & (sigma > 0.0), bad)
 
 
 _CLEANERS: dict[str, Callable[[Any], tuple[Any, dict[str, int]]]] = {

@@ -43,13 +43,14 @@ _MOST = 1500  # most steps used, those with the largest rotation
 _TURNED = 0.1  # rad, least rotation of a useful step
 
 
-def signed_permutations() -> np.ndarray:
-    """All signed permutations (48, 3, 3) of three axes, the identity first."""
+def signed_permutations(proper: bool = False) -> np.ndarray:
+    """All signed permutations (48, 3, 3) of three axes, the identity first; or the 24 rotations."""
     out = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             out.append(np.diag(signs)[:, order])
-    return np.array(out)
+    maps = np.array(out)
+    return maps[np.linalg.det(maps) > 0.0] if proper else maps
 
 
 class MotionIntegrals(NamedTuple):

@@ -167,11 +167,9 @@ def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndar
 def _sampled(stretch: np.ndarray, index: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Linear interpolation (nodes, ...) of values (stretches, fine + 1, ...) at real indices."""
     fine = values.shape[1]
-    index = np.clip(index, 0, fine - 1) + stretch * fine
-    low = np.minimum(index.astype(np.int64), len(values) * fine - 2)
-    flat = values.reshape(-1, *values.shape[2:])
-    share = (index - low).reshape(-1, *([1] * (flat.ndim - 1)))
-    return (1.0 - share) * flat[low] + share * flat[low + 1]
+    place = np.clip(index, 0, fine - 1) + stretch * fine
+    rows = between(place, values.reshape(len(values) * fine, -1))
+    return rows.reshape(-1, *values.shape[2:])
 
 
 def _swing(

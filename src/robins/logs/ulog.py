@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +75,7 @@ def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
     data, cut = read_whole(path, _LARGEST)
     if not data.startswith(MAGIC):
         raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
-    sound = _sound(data)
+    sound = max((end for *_, end in _messages(data)), default=min(_START, len(data)))
     if sound < len(data) or cut:
         sentence = (
             f"{Path(file).name} breaks off at byte {sound} of {len(data)}: what follows is half a "
@@ -97,15 +98,15 @@ def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
     return recording(file, samples, gnss and _fixes(file, gnss), mag=mag and _field(file, mag))
 
 
-def _sound(data: bytes) -> int:
-    """End of the unbroken sequence of messages [bytes]."""
+def _messages(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Type of each message of the unbroken sequence, and begin and end of its content [bytes]."""
     at = _START
     while at + _HEADER.size <= len(data):
         size, kind = _HEADER.unpack_from(data, at)
-        if kind not in _TYPES or size == 0 or at + _HEADER.size + size > len(data):
-            break
-        at += _HEADER.size + size
-    return min(at, len(data))
+        begin, at = at + _HEADER.size, at + _HEADER.size + size
+        if kind not in _TYPES or size == 0 or at > len(data):
+            return
+        yield kind, begin, at
 
 
 def _check_formats(file: str, data: bytes) -> None:
@@ -118,12 +119,9 @@ def _check_formats(file: str, data: bytes) -> None:
         LogError: there is such a definition, or one that contains itself.
     """
     formats: dict[str, list[tuple[str, int]]] = {}
-    at = _START
-    while at + _HEADER.size <= len(data):
-        size, kind = _HEADER.unpack_from(data, at)
-        at += _HEADER.size + size
+    for kind, begin, end in _messages(data):
         if kind == ord("F"):
-            name, _, fields = data[at - size : at].decode("utf-8", "replace").partition(":")
+            name, _, fields = data[begin:end].decode("utf-8", "replace").partition(":")
             formats[name] = []
             for field in fields.split(";"):
                 of, _, length = field.partition(" ")[0].partition("[")
