@@ -175,7 +175,7 @@ def test_a_circle_at_constant_speed_is_no_rest(monkeypatch, seed):
 
 
 def test_a_bias_on_a_circle_is_no_direction_of_travel(monkeypatch):
-    """At constant speed a bias ahead and the pull of the circle are one steady force."""
+    """A bias ahead and the pull of the circle are one steady force at constant speed."""
     monkeypatch.setattr(made_logs, "motion", lambda t: circle(t + 60.0))
     drive = made_logs.make_drive()
     assert errors(with_imu(drive, accel=drive.imu.accel + np.array([0.5, 0, 0]))) == []
