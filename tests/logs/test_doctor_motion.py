@@ -167,15 +167,14 @@ def circle(t):
     return 6.0 * s**2 * (3.0 - 2.0 * s), 0.0 * t, 0.0 * t, 0.4 + way / 20.0
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_circle_at_constant_speed_is_no_rest(monkeypatch, seed):
+def test_a_circle_at_constant_speed_is_no_rest(monkeypatch):
     """Rate and specific force are steady as at rest, and each lap is like the last."""
     monkeypatch.setattr(made_logs, "motion", circle)
-    assert errors(made_logs.make_drive(seed)) == []
+    assert errors(made_logs.make_drive()) == []
 
 
 def test_a_bias_on_a_circle_is_no_direction_of_travel(monkeypatch):
-    """A bias ahead and the pull of the circle are one steady force at constant speed."""
+    """A bias ahead and the pull of the circle, which are one steady force."""
     monkeypatch.setattr(made_logs, "motion", lambda t: circle(t + 60.0))
     drive = made_logs.make_drive()
     assert errors(with_imu(drive, accel=drive.imu.accel + np.array([0.5, 0, 0]))) == []

@@ -98,9 +98,8 @@ def arrays_in(path: AnyPath, names: Collection[str] | None = None) -> dict[str, 
         return arrays_of(data, damaged, names)
     if kind == "npy":
         return {"": array_of(data, "it", damaged)}
-    if kind == "parquet":
-        return columns_of_parquet(data, damaged)
-    return arrays_of_hdf5(data, damaged) if kind == "hdf5" else arrays_of_matlab(data, damaged)
+    others = {"parquet": columns_of_parquet, "hdf5": arrays_of_hdf5}
+    return others.get(kind, arrays_of_matlab)(data, damaged)
 
 
 def head_of(path: AnyPath) -> Head:

@@ -324,17 +324,14 @@ def _offset(a: float, b: float, c: float, d: float) -> str:
     def fits(shift: float | int) -> bool:
         return min(b, d + shift) - max(a, c + shift) > 0.5 * min(b - a, d - c)
 
-    weeks = round((a - GPS_EPOCH_S - c) / WEEK_S), round((c - GPS_EPOCH_S - a) / WEEK_S)
-    if fits(GPS_EPOCH_S + weeks[0] * WEEK_S) and weeks[0] > 0:
-        return (
-            f"Its times are seconds of the GPS week, the IMU's are absolute: they fit if GPS week "
-            f"{weeks[0]} ({GPS_EPOCH_S + weeks[0] * WEEK_S} s) is added."
-        )
-    if fits(-GPS_EPOCH_S - weeks[1] * WEEK_S) and weeks[1] > 0:
-        return (
-            f"Its times are absolute, the IMU's are seconds of the GPS week: they fit if GPS week "
-            f"{weeks[1]} ({GPS_EPOCH_S + weeks[1] * WEEK_S} s) is added to the IMU's."
-        )
+    for sign, later_s, how, to in (
+        (1, a - c, "seconds of the GPS week, the IMU's are absolute", ""),
+        (-1, c - a, "absolute, the IMU's are seconds of the GPS week", " to the IMU's"),
+    ):
+        week = round((later_s - GPS_EPOCH_S) / WEEK_S)
+        shift = GPS_EPOCH_S + week * WEEK_S
+        if week > 0 and fits(sign * shift):
+            return f"Its times are {how}: they fit if GPS week {week} ({shift} s) is added{to}."
     for shift, cause in (
         (float(GPS_EPOCH_S), "counted from 1980, the IMU's from 1970"),
         (-float(GPS_EPOCH_S), "counted from 1970, the IMU's from 1980"),
