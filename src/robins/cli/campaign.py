@@ -131,7 +131,7 @@ def _deliver(
     command, writing = command_line(), Progress("drawing figures")
 
     def write() -> Result:
-        return bench.publish(outcome, to, command=command, progress=writing, timeout_s=timeout_s)
+        return bench.publish(outcome, to, command=command, progress=writing, patience_s=timeout_s)
 
     print_and_write(outcome, write, writing, as_json)
 

@@ -17,7 +17,7 @@ def publishing(
     *,
     command: str = "",
     progress: Progress = ignore_progress,
-    timeout_s: float = 0.0,
+    patience_s: float = 0.0,
 ) -> Iterator[Callable[[Outcome], Result]]:
     """Hold a result folder while something is computed for it.
 
@@ -31,7 +31,7 @@ def publishing(
         out: the folder.
         command: how to make the result again, for its report.
         progress: called with the fraction done and the current activity while it is written.
-        timeout_s: how long to wait for another writer of the folder.
+        patience_s: how long to wait for another writer of the folder.
 
     Yields:
         A function that writes an outcome into the folder and returns the result read back.
@@ -42,7 +42,7 @@ def publishing(
             elsewhere.
     """
     with results.rescued(out):
-        writer = results.ResultWriter(out, command=command, timeout_s=timeout_s)
+        writer = results.ResultWriter(out, command=command, timeout_s=patience_s)
         try:
             yield partial(_write, writer, progress)
         finally:
@@ -55,14 +55,14 @@ def publish(
     *,
     command: str = "",
     progress: Progress = ignore_progress,
-    timeout_s: float = 0.0,
+    patience_s: float = 0.0,
 ) -> Result:
     """Write an outcome as a result folder with figures and a page; see `publishing`.
 
     Raises:
         robins.results.ResultError, robins.results.NotWritten: as for `publishing`.
     """
-    with publishing(out, command=command, progress=progress, timeout_s=timeout_s) as write:
+    with publishing(out, command=command, progress=progress, patience_s=patience_s) as write:
         return write(outcome)
 
 
