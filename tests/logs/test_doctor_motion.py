@@ -141,7 +141,7 @@ def test_tables_that_are_none_are_refused(drive):
         examine(with_imu(drive, gyro=drive.imu.gyro[:5]))
 
 
-@pytest.mark.parametrize("noise_m", [0.05, 1.0, 4.0])
+@pytest.mark.parametrize("noise_m", [0.05, 4.0])
 def test_a_straight_drive_of_rough_positions_is_sound(noise_m):
     """Positions alone, whose sigmas nobody states: their noise is no motion."""
     rng = np.random.default_rng(1)
