@@ -306,7 +306,7 @@ def test_a_second_coordinator_waits_for_the_report_of_the_first(tmp_path, monkey
     asked = []
 
     def publish(outcome, to, **options):
-        asked.append((to, options["timeout_s"]))
+        asked.append((to, options["patience_s"]))
         return SimpleNamespace(path=tmp_path, report="")
 
     monkeypatch.setattr(workbench, "publish", publish)
