@@ -295,7 +295,7 @@ def test_a_long_gap_of_the_slave_is_declared_and_the_pieces_are_joined(pairs, an
         answer = until(answers[0], len(piece.epoch_s))
         return answer, answer
 
-    monkeypatch.setattr(replaying, "_of_piece", instead)
+    monkeypatch.setattr(replaying, "_piece_estimates", instead)
     outcome = replay(logs.clean(replace(pairs[0], imu=replace(imu, **arrays))), PAIR)
     assert outcome.counts["imu_gaps_declared"] == 1
     assert len([n for n in outcome.notes if n.startswith("Aligned from")]) == 2
